@@ -1,0 +1,269 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATOR_H_
+#define OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATOR_H_
+
+#include "openmm/Integrator.h"
+#include "openmm/Kernel.h"
+#include "openmmvrattle/windowsExportVRattle.h"
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * An integrator for molecular dynamics with constraints whose step size varies and which is nevertheless
+ * time-reversible, so that the energy error stays bounded over long runs. It is the method VRATTLE of E. Barth,
+ * B. Leimkuhler and S. Reich, "A time-reversible variable-stepsize integrator for constrained dynamics"
+ * (SIAM J. Sci. Comput. 21, 1999); equation numbers below are that paper's.
+ *
+ * A monitor U(q,p) measures how hard the motion is to follow at the moment. The step density rho follows it by a
+ * symmetric recursion, by default (3.14),
+ *
+ *     rho[n+1/2] + rho[n-1/2] = u(q[n],p[n+1/2]) + u(q[n],p[n-1/2]),      u = B(U/U_ref),
+ *
+ * and the size of the step is stepSize/rho. stepSize is thus the step that is taken where U has its reference value
+ * U_ref (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The
+ * default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
+ *
+ * Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are
+ * solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the
+ * tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
+ * getMultipliers().
+ *
+ * The velocities in the Context belong to the same time as the positions, and satisfy the velocity constraints: kinetic
+ * plus potential energy of a State is the energy at that time.
+ *
+ * A step that cannot be completed throws an OpenMMException and leaves the Context in the state before that step.
+ */
+class OPENMMVRATTLE_EXPORT VariableStepRattleIntegrator : public OpenMM::Integrator {
+public:
+    /** The recursion that gives the next step density from the last one. All are symmetric in time. */
+    enum UpdateMethod {
+        /** (3.14): rho + rho' = u(q,p+) + u(q,p-), solved together with the constraints. The default. */
+        SemiExplicit = 0,
+        /** (3.15): rho + rho' = 2 u(q,p), known before the constraints are solved. */
+        Explicit = 1,
+        /**
+         * f(rho) + f(rho') = 2 f(u(q,p)) with f(rho) = (rho-a) - (1-a)^2/(rho-a) and a = nominal/maximum step: every
+         * step stays strictly below the maximum step size and no density is ever zero or negative.
+         */
+        Bounded = 2
+    };
+    /** The kinds of monitor. F is the applied force, v the velocity, m the mass, K = G M^-1 G^T. */
+    enum MonitorKind {
+        /** U2 (4.4): the Euclidean norm of the multipliers Lambda(q,p), in kJ/mol/nm^2. */
+        ConstraintMultipliers = 0,
+        /** The mass-weighted constraint force sqrt(Lambda^T K Lambda) of Gauss's principle, in nm amu^(1/2)/ps^2. */
+        ConstraintForce = 1,
+        /** The mass-weighted applied force sqrt(sum |F|^2/m), in nm amu^(1/2)/ps^2. */
+        AppliedForce = 2,
+        /** sqrt(Lambda^T K Lambda + sum |F|^2/m), in nm amu^(1/2)/ps^2. */
+        ConstraintAndAppliedForce = 3,
+        /** The p-norm of the multipliers, in kJ/mol/nm^2; see setNormOrder(). */
+        MultiplierPNorm = 4,
+        /** The p-norm over the particles of |F|, in kJ/mol/nm; see setNormOrder(). */
+        ForcePNorm = 5,
+        /** U1 (4.1): sqrt(sum m |v|^2 + sum |F|^2), in OpenMM's units. */
+        VectorField = 6,
+        /** The largest |F| of any particle, in kJ/mol/nm. */
+        MaxForce = 7,
+        /** The speed along the unconstrained trajectory in phase space, sqrt(sum |v|^2 + sum |F|^2). */
+        ArcLength = 8,
+        /** The largest sqrt(|v|^2 + |F|^2) of any particle. */
+        MaxParticleArcLength = 9,
+        /** The potential energy of one force group, in kJ/mol; see setMonitorForceGroup(). */
+        ForceGroupEnergy = 10
+    };
+    /**
+     * Create a VariableStepRattleIntegrator with one monitor, ConstraintMultipliers.
+     *
+     * @param stepSize    the nominal step size, taken where the monitor has its reference value (in ps)
+     */
+    explicit VariableStepRattleIntegrator(double stepSize);
+    /** Get the nominal step size: the step taken where the monitor has its reference value (in ps). */
+    double getNominalStepSize() const;
+    /**
+     * Set the nominal step size: the step taken where the monitor has its reference value. It must be positive, and lie
+     * between the step bounds where these have been set. In the course of a run the density is kept, so the steps
+     * change in proportion.
+     *
+     * @param size    the nominal step size, measured in ps
+     */
+    void setNominalStepSize(double size);
+    /** Get the size of the most recent step, or the nominal step size before the first step (in ps). */
+    double getStepSize() const override;
+    /** The same as setNominalStepSize(), so that scripts written for a fixed step keep working. */
+    void setStepSize(double size) override;
+    /** Get the smallest step size the monitor can ask for (in ps), or 0 if there is no bound. */
+    double getMinimumStepSize() const;
+    /**
+     * Set the smallest step size the monitor can ask for. With the sum updates SemiExplicit and Explicit, rho
+     * oscillates slightly about u and steps may leave the bounds by as much. Default: 1/50 of the nominal step size.
+     *
+     * @param size    the bound in ps, smaller than the nominal step size; 0 means no bound
+     */
+    void setMinimumStepSize(double size);
+    /** Get the largest step size the monitor can ask for (in ps), or 0 if there is no bound. */
+    double getMaximumStepSize() const;
+    /**
+     * Set the largest step size the monitor can ask for; see setMinimumStepSize(). With the update Bounded no step is ever larger.
+     * Default: twice the nominal step size.
+     *
+     * @param size    the bound in ps, larger than the nominal step size; 0 means no bound
+     */
+    void setMaximumStepSize(double size);
+    /** Get the recursion of the step density. */
+    UpdateMethod getUpdateMethod() const;
+    /** Set the recursion of the step density. */
+    void setUpdateMethod(UpdateMethod method);
+    /**
+     * Add a monitor. Several monitors are combined, each relative to its own reference value, as
+     * u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2).
+     *
+     * @param kind      what the monitor measures
+     * @param weight    its weight w_k > 0 in the combination; of no effect on a single monitor
+     * @param power     the positive power to which U_k/U_k,ref is raised
+     * @return the index of the monitor
+     */
+    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0);
+    /** Remove all monitors. With none the step is fixed at the nominal size: plain RATTLE (3.1-3.5). */
+    void clearMonitors();
+    /** Get the number of monitors. */
+    int getNumMonitors() const;
+    /**
+     * Get the settings of a monitor.
+     *
+     * @param index          the index of the monitor
+     * @param[out] kind      what the monitor measures
+     * @param[out] weight    its weight in the combination
+     * @param[out] power     the power to which it is raised
+     */
+    void getMonitor(int index, MonitorKind& kind, double& weight, double& power) const;
+    /** Get the force group whose energy the monitor ForceGroupEnergy uses. */
+    int getMonitorForceGroup() const;
+    /**
+     * Set the force group whose potential energy is the monitor ForceGroupEnergy: a positive function of the positions
+     * that is written as an OpenMM Force. While such a monitor exists, the group is left out of the dynamics.
+     *
+     * @param group    the force group, between 0 and 31. Default: 31
+     */
+    void setMonitorForceGroup(int group);
+    /** Get the order p of the monitors MultiplierPNorm and ForcePNorm. */
+    double getNormOrder() const;
+    /**
+     * Set the order p of the monitors MultiplierPNorm and ForcePNorm.
+     *
+     * @param order    the order, at least 1. Default: 8
+     */
+    void setNormOrder(double order);
+    /**
+     * Get the reference value U_ref of a monitor: where U equals it, the nominal step size is taken.
+     *
+     * @param index    the index of the monitor
+     * @return the value in force; 0 if none was set and no step has been taken
+     */
+    double getReferenceMonitorValue(int index = 0) const;
+    /**
+     * Set the reference value U_ref of a monitor. 0 (the default) means that it is taken at the first step: the first
+     * step then has the nominal size, and U_ref is the value of U that makes the sequence of densities start without
+     * oscillation, which is U at the start up to the change of U over a half step.
+     *
+     * @param value    the reference value in the monitor's unit, or 0
+     * @param index    the index of the monitor
+     */
+    void setReferenceMonitorValue(double value, int index = 0);
+    /**
+     * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size. The
+     * trial run starts at the current state of the Context, and everything but the reference values and the number of force
+     * evaluations is put back as it was.
+     *
+     * @param steps    the number of trial steps
+     */
+    void calibrate(int steps);
+    /** Get the step density rho of the last step; 1 before the first step. */
+    double getStepDensity() const;
+    /**
+     * Get the value U_k(q,p) of a monitor at the current positions and velocities, in the unit given with its kind.
+     * Before the first step this computes the forces.
+     *
+     * @param index    the index of the monitor
+     */
+    double getMonitorValue(int index = 0) const;
+    /**
+     * Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in the order of
+     * the System's constraints. The force of constraint k, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle
+     * i and the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d.
+     * Before the first step this computes the forces.
+     *
+     * @return the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles
+     */
+    std::vector<double> getMultipliers() const;
+    /** Get how often the forces have been computed for this integrator since the Context was created. */
+    long long getNumForceEvaluations() const;
+    /** Get how many iterations the solver of the constraints has taken since the Context was created. */
+    long long getNumSolverIterations() const;
+    /**
+     * Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, or
+     * was not solvable together with the constraints, and the density of the update Bounded was taken for that one
+     * step. The run goes on, but it is not exactly reversible across a rescued step.
+     */
+    long long getNumRescues() const;
+    /**
+     * Set the relative tolerance of constrained distances. Default: 1e-8.
+     *
+     * @param tol    the tolerance, as a fraction of the constrained distance; positive and finite
+     */
+    void setConstraintTolerance(double tol) override;
+    /**
+     * Advance the simulation by a number of steps.
+     *
+     * @param steps    the number of steps to take
+     */
+    void step(int steps) override;
+    /**
+     * Advance the simulation until a given time, which is met exactly by a shortened last step. The step density goes
+     * on smoothly after it, but the shortened step is not part of the reversible sequence: to retrace a run, use step().
+     * A time earlier than the current one does nothing.
+     *
+     * @param time    the time to which the simulation is advanced, in ps
+     */
+    void stepTo(double time);
+    /**
+     * Turn time around: the velocities change sign, and the half-step momentum and the density become those of the step that would
+     * have come next, so that the following steps retrace the trajectory. No force is computed, and the Context's time
+     * goes on forward.
+     */
+    void reverse();
+
+protected:
+    void initialize(OpenMM::ContextImpl& context) override;
+    void cleanup() override;
+    std::vector<std::string> getKernelNames() override;
+    void stateChanged(OpenMM::State::DataType changed) override;
+    double computeKineticEnergy() override;
+    bool kineticEnergyRequiresForce() const override;
+
+private:
+    struct Monitor {
+        MonitorKind kind;
+        double weight, power, reference;
+    };
+    void requireContext() const;
+    void checkMonitorIndex(int index) const;
+    void checkBounds(double nominal, double minimum, double maximum) const;
+    double advance(double maxTime);
+    double nominalStepSize, lastStepSize;
+    // The bounds in ps; a negative number stands for the default, which follows the nominal step size.
+    double minimumStepSize, maximumStepSize;
+    UpdateMethod updateMethod;
+    std::vector<Monitor> monitors;
+    int monitorForceGroup;
+    double normOrder;
+    OpenMM::Kernel kernel;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATOR_H_
