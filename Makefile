@@ -1,0 +1,63 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+#
+# Needs python3 with venv, a C++ compiler and the Python package index; everything else comes from there.
+
+PYTHON ?= python3
+VENV ?= .venv
+BUILD ?= build
+# Two at a time, or fewer where there are fewer processors: compiling Eigen takes about a gigabyte a job.
+JOBS ?= $(shell $(PYTHON) -c "import os; print(min(2, os.cpu_count() or 1))")
+
+BIN := $(VENV)/bin
+TOOLS := $(VENV)/.tools-installed
+CXX_FILES = $(shell find openmmapi platforms serialization tests -name '*.h' -o -name '*.cpp' 2>/dev/null)
+
+.PHONY: all demo test check-format cxx-test python-test install format clean
+
+all: test
+
+# Install the package and compare it with fixed steps; tables on the screen, figures in out/.
+demo: install
+	$(BIN)/python -m openmmvrattle compare --output out
+
+# One after the other, the fast ones first.
+test:
+	$(MAKE) check-format
+	$(MAKE) cxx-test
+	$(MAKE) python-test
+
+check-format: $(TOOLS)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $(CXX_FILES)
+
+cxx-test: $(TOOLS)
+	$(BIN)/cmake -S . -B $(BUILD) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
+		-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF
+	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
+	$(BIN)/ctest --test-dir $(BUILD) --output-on-failure --no-tests=error
+
+python-test: install $(TOOLS)
+	$(BIN)/python -m pytest python/tests
+
+# Always run: pip knows better than make what has changed. The build itself happens in an environment of its own.
+install: $(BIN)/python
+	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m pip install .
+
+format: $(TOOLS)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CXX_FILES)
+
+clean:
+	rm -rf $(BUILD) out $(VENV)
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+	# Dependency groups need pip 25.1.
+	$(BIN)/python -m pip install "pip>=25.1"
+
+$(TOOLS): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --group dev
+	touch $@
