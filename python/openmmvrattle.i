@@ -1,0 +1,821 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// The Python wrapper. Every method is written out in Python below (SWIG's feature "shadow"), with its signature, its
+// documentation and the handling of units; $action stands for the call of the C++ method behind it.
+
+%module(package="openmmvrattle") vrattle
+
+%include "std_string.i"
+%include "std_vector.i"
+%include "typemaps.i"
+
+%import(module="openmm") "swig/OpenMMSwigHeaders.i"
+
+// Without a name SWIG wraps no class for it, but it turns returned vectors into tuples.
+%template() std::vector<double>;
+
+%{
+#include "OpenMM.h"
+// SWIG writes out the conversions between all classes that OpenMM's interface file declares.
+#include "OpenMMAmoeba.h"
+#include "OpenMMDrude.h"
+#include "openmm/RPMDIntegrator.h"
+#include "openmm/RPMDMonteCarloBarostat.h"
+#include "openmmvrattle/VariableStepRattleIntegrator.h"
+
+namespace {
+
+/** Releases Python's global lock while it lives, so that other Python threads, and forces written in Python, can run. */
+class ReleasedGIL {
+public:
+    ReleasedGIL() : state(PyEval_SaveThread()) {
+    }
+    ~ReleasedGIL() {
+        PyEval_RestoreThread(state);
+    }
+    ReleasedGIL(const ReleasedGIL&) = delete;
+    ReleasedGIL& operator=(const ReleasedGIL&) = delete;
+
+private:
+    PyThreadState* state;
+};
+
+/** Turns a C++ exception into a Python one, of the class that OpenMM itself uses. */
+void setOpenMMException(const char* message) {
+    PyObject* module = PyImport_ImportModule("openmm");
+    PyObject* type = (module == NULL ? NULL : PyObject_GetAttrString(module, "OpenMMException"));
+    if (type != NULL)
+        PyErr_SetString(type, message);
+    Py_XDECREF(type);
+    Py_XDECREF(module);
+}
+
+} // namespace
+%}
+
+%exception {
+    try {
+        $action
+    }
+    catch (const std::exception& e) {
+        setOpenMMException(e.what());
+        SWIG_fail;
+    }
+}
+
+// For methods that may compute forces, which can take long or call Python code.
+%define RELEASES_GIL(method)
+%exception OpenMMVRattle::VariableStepRattleIntegrator::method {
+    try {
+        ReleasedGIL released;
+        $action
+    }
+    catch (const std::exception& e) {
+        setOpenMMException(e.what());
+        SWIG_fail;
+    }
+}
+%enddef
+RELEASES_GIL(calibrate)
+RELEASES_GIL(getMonitorValue)
+RELEASES_GIL(getMultipliers)
+RELEASES_GIL(reverse)
+RELEASES_GIL(step)
+RELEASES_GIL(stepTo)
+
+// Default arguments would turn into *args; the defaults stand in the Python signatures below.
+%feature("compactdefaultargs") OpenMMVRattle::VariableStepRattleIntegrator;
+%feature("autodoc", "0");
+
+%pythoncode %{
+import operator
+from collections.abc import Sequence
+
+from openmm import unit
+
+_STEP_UNIT = unit.picosecond
+_MULTIPLIER_UNIT = unit.kilojoule_per_mole / unit.nanometer**2
+
+
+def _number(value: object, name: str, target: unit.Unit = unit.dimensionless) -> float:
+    """Return `value`, a number or a Quantity, as a number in the unit `target`."""
+    wanted = "a plain number" if target is unit.dimensionless else f"a number or a Quantity in {target.get_name()}s"
+    if unit.is_quantity(value):
+        if not value.unit.is_compatible(target):
+            raise TypeError(f"{name} must be {wanted}, not a Quantity in {value.unit.get_name()}")
+        value = value.value_in_unit(target)
+    try:
+        if isinstance(value, (str, bytes)):  # float() would read these
+            raise TypeError
+        return float(value)
+    except TypeError:
+        raise TypeError(f"{name} must be {wanted}, not {value!r}") from None
+
+
+def _integer(value: object, name: str) -> int:
+    """Return `value` as an int, if it is an integer of any kind."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be an integer, not {value!r}") from None
+%}
+
+%feature("docstring") OpenMMVRattle::VariableStepRattleIntegrator "
+An integrator for molecular dynamics with constraints whose step size varies and which is nevertheless time-reversible, so
+that the energy error stays bounded over long runs. It is the method VRATTLE of E. Barth, B. Leimkuhler and S. Reich,
+'A time-reversible variable-stepsize integrator for constrained dynamics' (SIAM J. Sci. Comput. 21, 1999); equation
+numbers below are that paper's.
+
+A monitor U(q,p) measures how hard the motion is to follow at the moment. The step density rho follows it by a symmetric
+recursion, by default (3.14),
+
+    rho[n+1/2] + rho[n-1/2] = u(q[n],p[n+1/2]) + u(q[n],p[n-1/2]),      u = B(U/U_ref),
+
+and the size of the step is stepSize/rho. stepSize is thus the step that is taken where U has its reference value U_ref
+(see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The default monitor
+is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
+
+Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are solved
+with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the tolerance or
+the step fails with an exception; and the multipliers, that is the constraint forces, can be read with getMultipliers().
+
+The velocities in the Context belong to the same time as the positions, and satisfy the velocity constraints: kinetic plus
+potential energy of a State is the energy at that time.
+
+A step that cannot be completed raises an OpenMMException and leaves the Context in the state before that step.
+
+Update methods, for setUpdateMethod(). All are symmetric in time.
+
+ - SemiExplicit (3.14): rho + rho' = u(q,p+) + u(q,p-), solved together with the constraints. The default.
+ - Explicit (3.15): rho + rho' = 2 u(q,p), known before the constraints are solved.
+ - Bounded: f(rho) + f(rho') = 2 f(u(q,p)) with f(rho) = (rho-a) - (1-a)^2/(rho-a) and a = nominal/maximum step: every step
+   stays strictly below the maximum step size and no density is ever zero or negative.
+
+Kinds of monitor, for addMonitor(). F is the applied force, v the velocity, m the mass, K = G M^-1 G^T.
+
+ - ConstraintMultipliers: U2 (4.4), the Euclidean norm of the multipliers Lambda(q,p), in kJ/mol/nm^2.
+ - ConstraintForce: the mass-weighted constraint force sqrt(Lambda^T K Lambda) of Gauss's principle, in nm amu^(1/2)/ps^2.
+ - AppliedForce: the mass-weighted applied force sqrt(sum |F|^2/m), in nm amu^(1/2)/ps^2.
+ - ConstraintAndAppliedForce: sqrt(Lambda^T K Lambda + sum |F|^2/m), in nm amu^(1/2)/ps^2.
+ - MultiplierPNorm: the p-norm of the multipliers, in kJ/mol/nm^2; see setNormOrder().
+ - ForcePNorm: the p-norm over the particles of |F|, in kJ/mol/nm; see setNormOrder().
+ - VectorField: U1 (4.1), sqrt(sum m |v|^2 + sum |F|^2), in OpenMM's units.
+ - MaxForce: the largest |F| of any particle, in kJ/mol/nm.
+ - ArcLength: the speed along the unconstrained trajectory in phase space, sqrt(sum |v|^2 + sum |F|^2).
+ - MaxParticleArcLength: the largest sqrt(|v|^2 + |F|^2) of any particle.
+ - ForceGroupEnergy: the potential energy of one force group, in kJ/mol; see setMonitorForceGroup().
+
+Wrong values raise an openmm.OpenMMException; arguments of a wrong type or unit raise a TypeError.
+"
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::VariableStepRattleIntegrator %{
+def __init__(
+    self,
+    stepSize: float | unit.Quantity,
+    updateMethod: int | None = None,
+    minimumStepSize: float | unit.Quantity | None = None,
+    maximumStepSize: float | unit.Quantity | None = None,
+    constraintTolerance: float | None = None,
+    monitors: Sequence[int | tuple[int, float, float]] | None = None,
+    referenceMonitorValue: float | None = None,
+    normOrder: float | None = None,
+    monitorForceGroup: int | None = None,
+) -> None:
+    r"""
+    Create a VariableStepRattleIntegrator. Apart from stepSize, every argument can be set later by the method of the same
+    name, and None leaves its default.
+
+    Parameters
+    ----------
+    stepSize : float or Quantity
+        the nominal step size, taken where the monitor has its reference value (in ps)
+    updateMethod : int
+        the recursion of the step density: SemiExplicit (the default), Explicit or Bounded
+    minimumStepSize : float or Quantity
+        the smallest step size the monitor can ask for (in ps); 0 means no bound. Default: 1/50 of stepSize
+    maximumStepSize : float or Quantity
+        the largest step size the monitor can ask for (in ps); 0 means no bound. Default: twice stepSize
+    constraintTolerance : float
+        the relative tolerance of constrained distances. Default: 1e-8
+    monitors : list
+        the monitors in place of the default one, ConstraintMultipliers: each a kind, or a tuple (kind, weight, power).
+        The empty list means fixed steps: plain RATTLE
+    referenceMonitorValue : float
+        the value of the first monitor at which the nominal step is taken; 0 (the default) means that it is taken at the
+        first step
+    normOrder : float
+        the order p of the monitors MultiplierPNorm and ForcePNorm. Default: 8
+    monitorForceGroup : int
+        the force group whose energy is the monitor ForceGroupEnergy. Default: 31
+    """
+    _vrattle.VariableStepRattleIntegrator_swiginit(self, $action(_number(stepSize, "stepSize", _STEP_UNIT)))
+    if updateMethod is not None:
+        self.setUpdateMethod(updateMethod)
+    if minimumStepSize is not None:
+        self.setMinimumStepSize(minimumStepSize)
+    if maximumStepSize is not None:
+        self.setMaximumStepSize(maximumStepSize)
+    if constraintTolerance is not None:
+        self.setConstraintTolerance(constraintTolerance)
+    if normOrder is not None:
+        self.setNormOrder(normOrder)
+    if monitorForceGroup is not None:
+        self.setMonitorForceGroup(monitorForceGroup)
+    if monitors is not None:
+        if not isinstance(monitors, (list, tuple)):
+            raise TypeError(f"monitors must be a list of kinds or (kind, weight, power) tuples, not {monitors!r}")
+        self.clearMonitors()
+        for monitor in monitors:
+            self.addMonitor(*(monitor if isinstance(monitor, (list, tuple)) else (monitor,)))
+    if referenceMonitorValue is not None:
+        self.setReferenceMonitorValue(referenceMonitorValue)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNominalStepSize %{
+def getNominalStepSize(self) -> unit.Quantity:
+    r"""
+    Get the nominal step size: the step taken where the monitor has its reference value.
+
+    Returns
+    -------
+    Quantity
+        the nominal step size in picoseconds
+    """
+    return unit.Quantity($action(self), _STEP_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setNominalStepSize %{
+def setNominalStepSize(self, size: float | unit.Quantity) -> None:
+    r"""
+    Set the nominal step size: the step taken where the monitor has its reference value. In the course of a run the density
+    is kept, so the steps change in proportion.
+
+    Parameters
+    ----------
+    size : float or Quantity
+        the nominal step size (in ps): positive, and between the step bounds where these have been set
+
+    Raises
+    ------
+    OpenMMException
+        if size is not a positive finite number between the step bounds
+    """
+    $action(self, _number(size, "size", _STEP_UNIT))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getStepSize %{
+def getStepSize(self) -> unit.Quantity:
+    r"""
+    Get the size of the most recent step, or the nominal step size before the first step.
+
+    Returns
+    -------
+    Quantity
+        the step size in picoseconds
+    """
+    return unit.Quantity($action(self), _STEP_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setStepSize %{
+def setStepSize(self, size: float | unit.Quantity) -> None:
+    r"""
+    The same as setNominalStepSize(), so that scripts written for a fixed step keep working.
+
+    Parameters
+    ----------
+    size : float or Quantity
+        the nominal step size (in ps): positive, and between the step bounds where these have been set
+
+    Raises
+    ------
+    OpenMMException
+        if size is not a positive finite number between the step bounds
+    """
+    $action(self, _number(size, "size", _STEP_UNIT))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMinimumStepSize %{
+def getMinimumStepSize(self) -> unit.Quantity:
+    r"""
+    Get the smallest step size the monitor can ask for.
+
+    Returns
+    -------
+    Quantity
+        the bound in picoseconds, 0 if there is none
+    """
+    return unit.Quantity($action(self), _STEP_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setMinimumStepSize %{
+def setMinimumStepSize(self, size: float | unit.Quantity) -> None:
+    r"""
+    Set the smallest step size the monitor can ask for. With the sum updates SemiExplicit and Explicit, rho oscillates
+    slightly about u and steps may leave the bounds by as much. Default: 1/50 of the nominal step size.
+
+    Parameters
+    ----------
+    size : float or Quantity
+        the bound (in ps), smaller than the nominal step size; 0 means no bound
+
+    Raises
+    ------
+    OpenMMException
+        if size is negative, not finite, or not smaller than the nominal step size
+    """
+    $action(self, _number(size, "size", _STEP_UNIT))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMaximumStepSize %{
+def getMaximumStepSize(self) -> unit.Quantity:
+    r"""
+    Get the largest step size the monitor can ask for.
+
+    Returns
+    -------
+    Quantity
+        the bound in picoseconds, 0 if there is none
+    """
+    return unit.Quantity($action(self), _STEP_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setMaximumStepSize %{
+def setMaximumStepSize(self, size: float | unit.Quantity) -> None:
+    r"""
+    Set the largest step size the monitor can ask for; see setMinimumStepSize(). With the update Bounded no step is ever
+    larger. Default: twice the nominal step size.
+
+    Parameters
+    ----------
+    size : float or Quantity
+        the bound (in ps), larger than the nominal step size; 0 means no bound
+
+    Raises
+    ------
+    OpenMMException
+        if size is not finite, or neither 0 nor larger than the nominal step size
+    """
+    $action(self, _number(size, "size", _STEP_UNIT))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getUpdateMethod %{
+def getUpdateMethod(self) -> int:
+    r"""
+    Get the recursion of the step density.
+
+    Returns
+    -------
+    int
+        SemiExplicit, Explicit or Bounded
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setUpdateMethod %{
+def setUpdateMethod(self, method: int) -> None:
+    r"""
+    Set the recursion of the step density.
+
+    Parameters
+    ----------
+    method : int
+        SemiExplicit (the default), Explicit or Bounded
+
+    Raises
+    ------
+    OpenMMException
+        if there is no such method
+    """
+    $action(self, _integer(method, "method"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::addMonitor %{
+def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0) -> int:
+    r"""
+    Add a monitor. Several monitors are combined, each relative to its own reference value, as
+    u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2).
+
+    Parameters
+    ----------
+    kind : int
+        what the monitor measures: one of the constants in the description of this class
+    weight : float
+        its weight w_k > 0 in the combination; of no effect on a single monitor
+    power : float
+        the positive power to which U_k/U_k,ref is raised
+
+    Returns
+    -------
+    int
+        the index of the monitor
+
+    Raises
+    ------
+    OpenMMException
+        if there is no such kind, or weight or power is not a positive finite number
+    """
+    return $action(self, _integer(kind, "kind"), _number(weight, "weight"), _number(power, "power"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::clearMonitors %{
+def clearMonitors(self) -> None:
+    r"""Remove all monitors. With none the step is fixed at the nominal size: plain RATTLE (3.1-3.5)."""
+    $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumMonitors %{
+def getNumMonitors(self) -> int:
+    r"""
+    Get the number of monitors.
+
+    Returns
+    -------
+    int
+        the number of monitors
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMonitor %{
+def getMonitor(self, index: int) -> tuple[int, float, float]:
+    r"""
+    Get the settings of a monitor.
+
+    Parameters
+    ----------
+    index : int
+        the index of the monitor
+
+    Returns
+    -------
+    tuple
+        (kind, weight, power): what the monitor measures, its weight in the combination, and the power to which it is raised
+
+    Raises
+    ------
+    OpenMMException
+        if there is no monitor with this index
+    """
+    return tuple($action(self, _integer(index, "index")))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMonitorForceGroup %{
+def getMonitorForceGroup(self) -> int:
+    r"""
+    Get the force group whose energy the monitor ForceGroupEnergy uses.
+
+    Returns
+    -------
+    int
+        the force group
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setMonitorForceGroup %{
+def setMonitorForceGroup(self, group: int) -> None:
+    r"""
+    Set the force group whose potential energy is the monitor ForceGroupEnergy: a positive function of the positions that is
+    written as an OpenMM Force. While such a monitor exists, the group is left out of the dynamics.
+
+    Parameters
+    ----------
+    group : int
+        the force group, between 0 and 31. Default: 31
+
+    Raises
+    ------
+    OpenMMException
+        if group does not lie between 0 and 31
+    """
+    $action(self, _integer(group, "group"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNormOrder %{
+def getNormOrder(self) -> float:
+    r"""
+    Get the order p of the monitors MultiplierPNorm and ForcePNorm.
+
+    Returns
+    -------
+    float
+        the order
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setNormOrder %{
+def setNormOrder(self, order: float) -> None:
+    r"""
+    Set the order p of the monitors MultiplierPNorm and ForcePNorm.
+
+    Parameters
+    ----------
+    order : float
+        the order, at least 1. Default: 8
+
+    Raises
+    ------
+    OpenMMException
+        if order is not a finite number of at least 1
+    """
+    $action(self, _number(order, "order"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getReferenceMonitorValue %{
+def getReferenceMonitorValue(self, index: int = 0) -> float:
+    r"""
+    Get the reference value U_ref of a monitor: where U equals it, the nominal step size is taken.
+
+    Parameters
+    ----------
+    index : int
+        the index of the monitor
+
+    Returns
+    -------
+    float
+        the value in force, in the monitor's unit; 0 if none was set and no step has been taken
+
+    Raises
+    ------
+    OpenMMException
+        if there is no monitor with this index
+    """
+    return $action(self, _integer(index, "index"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setReferenceMonitorValue %{
+def setReferenceMonitorValue(self, value: float, index: int = 0) -> None:
+    r"""
+    Set the reference value U_ref of a monitor. 0 (the default) means that it is taken at the first step: the first step then
+    has the nominal size, and U_ref is the value of U that makes the sequence of densities start without oscillation, which
+    is U at the start up to the change of U over a half step.
+
+    Parameters
+    ----------
+    value : float
+        the reference value in the monitor's unit, or 0
+    index : int
+        the index of the monitor
+
+    Raises
+    ------
+    OpenMMException
+        if value is negative or not finite, or there is no monitor with this index
+    """
+    $action(self, _number(value, "value"), _integer(index, "index"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::calibrate %{
+def calibrate(self, steps: int) -> None:
+    r"""
+    Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size. The trial run
+    starts at the current state of the Context, and everything but the reference values and the number of force evaluations
+    is put back as it was.
+
+    Parameters
+    ----------
+    steps : int
+        the number of trial steps
+
+    Raises
+    ------
+    OpenMMException
+        if steps is not positive, there is no monitor, there is no Context, or a trial step fails
+    """
+    $action(self, _integer(steps, "steps"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getStepDensity %{
+def getStepDensity(self) -> float:
+    r"""
+    Get the step density rho of the last step; 1 before the first step.
+
+    Returns
+    -------
+    float
+        the step density
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMonitorValue %{
+def getMonitorValue(self, index: int = 0) -> float:
+    r"""
+    Get the value U_k(q,p) of a monitor at the current positions and velocities. Before the first step this computes the
+    forces.
+
+    Parameters
+    ----------
+    index : int
+        the index of the monitor
+
+    Returns
+    -------
+    float
+        the value, in the unit given with the monitor's kind
+
+    Raises
+    ------
+    OpenMMException
+        if there is no monitor with this index, or no Context
+    """
+    return $action(self, _integer(index, "index"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMultipliers %{
+def getMultipliers(self) -> unit.Quantity:
+    r"""
+    Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in the order
+    of the System's constraints. The force of constraint k, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle
+    i and the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d. Before the first
+    step this computes the forces.
+
+    Returns
+    -------
+    Quantity
+        a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles
+
+    Raises
+    ------
+    OpenMMException
+        if there is no Context
+    """
+    return unit.Quantity(list($action(self)), _MULTIPLIER_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumForceEvaluations %{
+def getNumForceEvaluations(self) -> int:
+    r"""
+    Get how often the forces have been computed for this integrator since the Context was created.
+
+    Returns
+    -------
+    int
+        the number of force evaluations
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumSolverIterations %{
+def getNumSolverIterations(self) -> int:
+    r"""
+    Get how many iterations the solver of the constraints has taken since the Context was created.
+
+    Returns
+    -------
+    int
+        the number of iterations
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumRescues %{
+def getNumRescues(self) -> int:
+    r"""
+    Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, or was not
+    solvable together with the constraints, and the density of the update Bounded was taken for that one step. The run goes
+    on, but it is not exactly reversible across a rescued step.
+
+    Returns
+    -------
+    int
+        the number of rescued steps
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setConstraintTolerance %{
+def setConstraintTolerance(self, tol: float) -> None:
+    r"""
+    Set the relative tolerance of constrained distances. Default: 1e-8.
+
+    Parameters
+    ----------
+    tol : float
+        the tolerance, as a fraction of the constrained distance; positive and finite
+
+    Raises
+    ------
+    OpenMMException
+        if tol is not a positive finite number
+    """
+    $action(self, _number(tol, "tol"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::step %{
+def step(self, steps: int) -> None:
+    r"""
+    Advance the simulation by a number of steps.
+
+    Parameters
+    ----------
+    steps : int
+        the number of steps to take
+
+    Raises
+    ------
+    OpenMMException
+        if there is no Context, or a step cannot be completed; the Context is then in the state before that step
+    """
+    $action(self, _integer(steps, "steps"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::stepTo %{
+def stepTo(self, time: float | unit.Quantity) -> None:
+    r"""
+    Advance the simulation until a given time, which is met exactly by a shortened last step. The step density goes on
+    smoothly after it, but the shortened step is not part of the reversible sequence: to retrace a run, use step(). A time
+    earlier than the current one does nothing.
+
+    Parameters
+    ----------
+    time : float or Quantity
+        the time to which the simulation is advanced (in ps)
+
+    Raises
+    ------
+    OpenMMException
+        if time is not finite, there is no Context, or a step cannot be completed; the Context is then in the state before
+        that step
+    """
+    $action(self, _number(time, "time", _STEP_UNIT))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::reverse %{
+def reverse(self) -> None:
+    r"""
+    Turn time around: the velocities change sign, and the half-step momentum and the density become those of the step that
+    would have come next, so that the following steps retrace the trajectory. No force is computed, and the Context's time
+    goes on forward.
+
+    Raises
+    ------
+    OpenMMException
+        if there is no Context, or the step that would have come next cannot be solved for
+    """
+    $action(self)
+%}
+
+namespace OpenMMVRattle {
+
+// The C++ side of the above. virtual methods of the base class that are not named here are inherited in Python as well.
+class VariableStepRattleIntegrator : public OpenMM::Integrator {
+public:
+    enum UpdateMethod { SemiExplicit = 0, Explicit = 1, Bounded = 2 };
+    enum MonitorKind {
+        ConstraintMultipliers = 0,
+        ConstraintForce = 1,
+        AppliedForce = 2,
+        ConstraintAndAppliedForce = 3,
+        MultiplierPNorm = 4,
+        ForcePNorm = 5,
+        VectorField = 6,
+        MaxForce = 7,
+        ArcLength = 8,
+        MaxParticleArcLength = 9,
+        ForceGroupEnergy = 10
+    };
+    explicit VariableStepRattleIntegrator(double stepSize);
+    double getNominalStepSize() const;
+    void setNominalStepSize(double size);
+    double getStepSize() const;
+    void setStepSize(double size);
+    double getMinimumStepSize() const;
+    void setMinimumStepSize(double size);
+    double getMaximumStepSize() const;
+    void setMaximumStepSize(double size);
+    UpdateMethod getUpdateMethod() const;
+    void setUpdateMethod(UpdateMethod method);
+    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0);
+    void clearMonitors();
+    int getNumMonitors() const;
+    %apply int& OUTPUT { MonitorKind& kind };
+    %apply double& OUTPUT { double& weight };
+    %apply double& OUTPUT { double& power };
+    void getMonitor(int index, MonitorKind& kind, double& weight, double& power) const;
+    %clear MonitorKind& kind;
+    %clear double& weight;
+    %clear double& power;
+    int getMonitorForceGroup() const;
+    void setMonitorForceGroup(int group);
+    double getNormOrder() const;
+    void setNormOrder(double order);
+    double getReferenceMonitorValue(int index = 0) const;
+    void setReferenceMonitorValue(double value, int index = 0);
+    void calibrate(int steps);
+    double getStepDensity() const;
+    double getMonitorValue(int index = 0) const;
+    std::vector<double> getMultipliers() const;
+    long long getNumForceEvaluations() const;
+    long long getNumSolverIterations() const;
+    long long getNumRescues() const;
+    void setConstraintTolerance(double tol);
+    void step(int steps);
+    void stepTo(double time);
+    void reverse();
+};
+
+} // namespace OpenMMVRattle
