@@ -1,0 +1,237 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The command line: ``python -m openmmvrattle``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import openmm
+
+from .testsystems import SYSTEMS, ComparisonSettings
+
+_DEFAULT_SYSTEMS = ("double-pendulum", "alanine-dipeptide-hbonds", "alanine-dipeptide-allbonds")
+
+_EXAMPLES = """examples:
+  python -m openmmvrattle compare
+      run three systems and write tables and pictures to the folder out
+  python -m openmmvrattle compare --system light-heavy-chain --output whip
+      run one system
+  python -m openmmvrattle compare --system rigid-waters --platform CPU --time 1 --evaluations 2000
+      choose platform, simulated time in ps and number of force evaluations
+  python -m openmmvrattle compare --quick
+      only the first moments of each system, for a look that takes seconds
+"""
+
+
+class _UsageError(Exception):
+    """Something on the command line cannot be done; the message says what, in one sentence."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, 2 for wrong usage, 130 after an interrupt."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    try:
+        return _compare(options)
+    except _UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m openmmvrattle",
+        description="Time-reversible variable-step dynamics with constraints for OpenMM.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    compare = commands.add_parser(
+        "compare",
+        help="compare integrators at an equal number of force evaluations",
+        description="Run OpenMM's VerletIntegrator and VariableVerletIntegrator, RATTLE with fixed steps and RATTLE "
+        "with variable steps on the same systems, each with the same number of force evaluations, and show how well "
+        "they keep the energy.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    compare.add_argument(
+        "--system",
+        nargs="+",
+        default=list(_DEFAULT_SYSTEMS),
+        metavar="NAME",
+        help="systems to run: " + ", ".join(SYSTEMS) + " (default: " + ", ".join(_DEFAULT_SYSTEMS) + ")",
+    )
+    compare.add_argument("--platform", default="Reference", metavar="NAME", help="OpenMM platform (default: Reference)")
+    compare.add_argument(
+        "--output", type=Path, default=Path("out"), metavar="FOLDER", help="folder for the files (default: out)"
+    )
+    compare.add_argument(
+        "--evaluations", type=int, metavar="N", help="force evaluations of each integrator (default: by system)"
+    )
+    compare.add_argument("--time", type=float, metavar="PS", help="simulated time in ps (default: by system)")
+    compare.add_argument("--quick", action="store_true", help="run only the first moments of each system")
+    return parser
+
+
+def _version() -> str:
+    try:
+        own = importlib.metadata.version("openmm-vrattle")
+    except importlib.metadata.PackageNotFoundError:
+        own = "not installed"
+    return f"openmm-vrattle {own} (OpenMM {openmm.Platform.getOpenMMVersion()})"
+
+
+def _compare(options: argparse.Namespace) -> int:
+    _check(options)
+    try:
+        from rich.console import Console
+
+        from . import plots
+    except ImportError as error:
+        raise _UsageError(f"the comparison needs the package {error.name}, which is not installed.") from error
+    from .comparison import compare, write_json, write_series, write_summary
+
+    # On a terminal rich finds the width itself; in a file or a pipe the table must not be cut.
+    console = Console() if sys.stdout.isatty() else Console(width=160)
+    comparisons = []
+    for name in options.system:
+        test_system = SYSTEMS[name]()
+        settings = _settings(test_system.settings, options)
+        with _progress_bar(console, test_system.description) as progress:
+            comparison = compare(test_system, options.platform, settings, progress)
+        if comparison.runs:
+            comparisons.append(comparison)
+            _print_comparison(console, comparison)
+            write_series(comparison, options.output / f"{name}-series.csv")
+            write_json(comparison, options.output / f"{name}.json")
+            plots.save_comparison(comparison, options.output / f"{name}.png")
+            write_summary(comparisons, options.output / "summary.csv")
+        if comparison.interrupted:
+            console.print(f"Interrupted; what was done is in {options.output}.", highlight=False, soft_wrap=True)
+            return 130
+    console.print(f"Tables, courses and pictures are in {options.output}.", highlight=False, soft_wrap=True)
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    for name in options.system:
+        if name not in SYSTEMS:
+            raise _UsageError(f"there is no system '{name}'; the systems are {', '.join(SYSTEMS)}.")
+    platforms = [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
+    if options.platform not in platforms:
+        raise _UsageError(f"there is no platform '{options.platform}' here; the platforms are {', '.join(platforms)}.")
+    if options.evaluations is not None and options.evaluations < 10:
+        raise _UsageError("the number of force evaluations must be at least 10.")
+    if options.time is not None and not 0.0 < options.time < math.inf:
+        raise _UsageError("the simulated time must be positive.")
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _UsageError(f"the folder {options.output} cannot be made: {error.strerror}.") from error
+
+
+def _settings(settings: ComparisonSettings, options: argparse.Namespace) -> ComparisonSettings:
+    """The settings of a system with what the command line changes; the mean step is kept unless both are given."""
+    from .comparison import quick_settings
+
+    total_time, evaluations = settings.total_time, settings.force_evaluations
+    if options.time is not None:
+        evaluations = max(10, round(evaluations * options.time / total_time))
+        total_time = options.time
+    if options.evaluations is not None:
+        evaluations = options.evaluations
+    settings = replace(settings, total_time=total_time, force_evaluations=evaluations)
+    return quick_settings(settings) if options.quick else settings
+
+
+def _progress_bar(console, description: str):
+    """A context that shows a progress bar and gives the function that moves it."""
+    from contextlib import contextmanager
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    @contextmanager
+    def bar():
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}% {task.fields[activity]}"),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+            tasks = {}
+
+            def move(name: str, activity: str, fraction: float) -> None:
+                if name not in tasks:
+                    tasks[name] = progress.add_task(name, total=1.0, activity="")
+                progress.update(tasks[name], completed=fraction, activity=activity)
+
+            console.print(f"\n[bold]{description}[/bold]", highlight=False)
+            yield move
+
+    return bar()
+
+
+def _print_comparison(console, comparison) -> None:
+    from rich.table import Table
+
+    from .comparison import verdict
+
+    table = Table(
+        title=f"{comparison.system_name}: {comparison.total_time:g} ps, platform {comparison.platform}, "
+        f"E(0) = {comparison.initial_energy:.6g} kJ/mol",
+        title_justify="left",
+    )
+    table.add_column("integrator")
+    for heading in (
+        "largest\nenergy error\n(kJ/mol)",
+        "rms\nenergy error\n(kJ/mol)",
+        "energy error\nat the end\n(kJ/mol)",
+        "smallest\nstep\n(ps)",
+        "largest\nstep\n(ps)",
+        "force\nevaluations",
+        "largest\nconstraint\nerror",
+        "wall time\nper step\n(µs)",
+        "energy\nsamples",
+    ):
+        table.add_column(heading, justify="right")
+    best = comparison.best()
+    for run in comparison.runs:
+        style = "bold green" if run is best else ("red" if run.failure is not None else None)
+        name = run.name if run.failure is None else f"{run.name} (failed)"
+        table.add_row(
+            name,
+            _number(run.largest_energy_error),
+            _number(run.rms_energy_error),
+            _number(run.final_energy_error),
+            _number(run.smallest_step),
+            _number(run.largest_step),
+            f"{run.force_evaluations:,}",
+            _number(run.largest_constraint_error),
+            _number(run.seconds_per_step * 1e6, "{:.1f}"),
+            f"{run.energy_samples:,}",
+            style=style,
+        )
+    console.print(table)
+    for sentence in verdict(comparison):
+        console.print(sentence, highlight=False, soft_wrap=True, markup=False)
+
+
+def _number(value: float, pattern: str = "{:.2g}") -> str:
+    return pattern.format(value) if math.isfinite(value) else "-"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""Pictures of comparisons: energy error and step size against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from .comparison import Comparison, IntegratorRun, envelope
+
+__all__ = ["draw_comparison", "save_comparison"]
+
+# Colours that can be told apart with any colour vision (Okabe and Ito).
+_COLOURS = {"fixed": "#E69F00", "variable": "#56B4E9", "control": "#555555"}
+_PRODUCT_COLOURS = ("#D55E00", "#009E73", "#CC79A7", "#0072B2")
+_ENERGY_FLOOR = 1e-12
+"""kJ/mol; smaller errors cannot be told from rounding."""
+
+
+def draw_comparison(comparison: Comparison, windows: int = 500) -> Figure:
+    """Draw the energy error of all runs above their step sizes.
+
+    Each line shows the largest value in each of many short windows of time, the shade below it reaches to the smallest.
+
+    Args:
+        comparison: the runs to draw.
+        windows: the number of windows across the picture.
+    """
+    figure = Figure(figsize=(9.0, 6.2), dpi=110, layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    product_colours = iter(_PRODUCT_COLOURS * 3)
+    for run in comparison.runs:
+        colour = _COLOURS.get(run.method) or next(product_colours)
+        if len(run.series.times) > 1:
+            _draw_run(top, bottom, comparison, run, colour, windows)
+        else:
+            top.plot([], [], color=colour, label=f"{run.name} (failed)")
+    top.set_yscale("log")
+    top.set_ylabel("energy error |E - E(0)|\n(kJ/mol)")
+    top.set_title(
+        f"{comparison.description}: about {comparison.force_evaluations:,} force evaluations each", fontsize=11
+    )
+    bottom.set_yscale("log")
+    bottom.set_ylabel("step size (ps)")
+    bottom.set_xlabel("time (ps)")
+    bottom.set_xlim(0.0, comparison.total_time)
+    for axes in (top, bottom):
+        axes.grid(True, which="major", color="#dddddd", linewidth=0.6)
+        axes.set_axisbelow(True)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    figure.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9.5)
+    return figure
+
+
+def save_comparison(comparison: Comparison, path: Path) -> None:
+    """Draw a comparison and write it to a PNG file."""
+    draw_comparison(comparison).savefig(path)
+
+
+def _draw_run(top: Any, bottom: Any, comparison: Comparison, run: IntegratorRun, colour: str, windows: int) -> None:
+    reduced = envelope(run.series, comparison.total_time, windows)
+    largest = np.maximum(np.abs(reduced.largest_energy_errors), _ENERGY_FLOOR)
+    smallest = np.maximum(np.abs(reduced.smallest_energy_errors), _ENERGY_FLOOR)
+    product = run.method == "vrattle"
+    # VerletIntegrator and RATTLE with fixed steps nearly coincide: dashes let the one below be seen.
+    dashes = "--" if run.method == "control" else "-"
+    style: dict[str, Any] = {"color": colour, "linewidth": 1.7 if product else 1.2, "linestyle": dashes}
+    order = 3 if product else 2
+    label = run.name if run.failure is None else f"{run.name} (failed at {run.simulated_time:.3g} ps)"
+    top.plot(reduced.times, largest, label=label, zorder=order, **style)
+    top.fill_between(reduced.times, smallest, largest, color=colour, alpha=0.12, linewidth=0, zorder=order - 1)
+    bottom.plot(reduced.times, reduced.smallest_steps, zorder=order, **style)
+    bottom.fill_between(
+        reduced.times,
+        reduced.smallest_steps,
+        reduced.largest_steps,
+        color=colour,
+        alpha=0.2,
+        linewidth=0,
+        zorder=order - 1,
+    )
