@@ -51,7 +51,7 @@ public:
     /** The step density of the last step. */
     virtual double getStepDensity() const = 0;
     /** The reference value in force of a monitor, 0 if there is none yet. */
-    virtual double getReferenceMonitorValue(int index) const = 0;
+    virtual double getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator, int index) = 0;
     /** The value of a monitor at the current state. */
     virtual double getMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                    int index) = 0;

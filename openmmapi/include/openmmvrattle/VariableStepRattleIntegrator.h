@@ -174,6 +174,8 @@ public:
      * @param index    the index of the monitor
      */
     void setReferenceMonitorValue(double value, int index = 0);
+    /** Get the reference value that was set for a monitor; 0 if it is to be taken at the first step. */
+    double getSetReferenceMonitorValue(int index) const;
     /**
      * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size. The
      * trial run starts at the current state of the Context, and everything but the reference values and the number of force
@@ -250,6 +252,7 @@ private:
         MonitorKind kind;
         double weight, power, reference;
     };
+    void settingsChanged();
     void requireContext() const;
     void checkMonitorIndex(int index) const;
     void checkBounds(double nominal, double minimum, double maximum) const;

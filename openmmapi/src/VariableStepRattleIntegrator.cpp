@@ -1,0 +1,330 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "openmm/OpenMMException.h"
+#include "openmm/Platform.h"
+#include "openmm/internal/ContextImpl.h"
+#include "openmmvrattle/VRattleKernels.h"
+#include <cmath>
+#include <limits>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using OpenMM::ContextImpl;
+using OpenMM::OpenMMException;
+using OpenMM::Platform;
+using std::string;
+using std::vector;
+
+namespace {
+
+// The bounds' defaults as fractions of the nominal step size (API: nominal/50 and 2 nominal).
+const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
+const double DEFAULT_MAXIMUM_FACTOR = 2.0;
+const double USE_DEFAULT = -1.0;
+
+void requirePositive(double value, const string& name) {
+    if (!(value > 0) || !std::isfinite(value)) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: the " << name << " must be a positive finite number, not " << value;
+        throw OpenMMException(message.str());
+    }
+}
+
+void requireBound(double value, const string& name) {
+    if (!(value >= 0) || !std::isfinite(value)) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: the " << name
+                << " must be a positive finite number, or 0 for no bound, not " << value;
+        throw OpenMMException(message.str());
+    }
+}
+
+string majorMinor(const string& version) {
+    size_t first = version.find('.');
+    if (first == string::npos)
+        return version;
+    size_t second = version.find_first_not_of("0123456789", first + 1);
+    return version.substr(0, second);
+}
+
+// An OpenMM plugin depends on the binary interface of the OpenMM it was built against.
+void checkOpenMMVersion() {
+    const string built = OPENMMVRATTLE_OPENMM_VERSION;
+    const string running = Platform::getOpenMMVersion();
+    if (majorMinor(running) != built)
+        throw OpenMMException("VariableStepRattleIntegrator: this plugin was built for OpenMM " + built +
+                              " and cannot run with OpenMM " + running + "; install openmm==" + built +
+                              ".* or rebuild the plugin");
+}
+
+} // namespace
+
+VariableStepRattleIntegrator::VariableStepRattleIntegrator(double stepSize) :
+        nominalStepSize(0), lastStepSize(0), minimumStepSize(USE_DEFAULT), maximumStepSize(USE_DEFAULT),
+        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8) {
+    monitors.push_back({ConstraintMultipliers, 1.0, 1.0, 0.0});
+    setNominalStepSize(stepSize);
+    setConstraintTolerance(1e-8);
+}
+
+double VariableStepRattleIntegrator::getNominalStepSize() const {
+    return nominalStepSize;
+}
+
+void VariableStepRattleIntegrator::setNominalStepSize(double size) {
+    requirePositive(size, "step size");
+    checkBounds(size, minimumStepSize, maximumStepSize);
+    nominalStepSize = size;
+    Integrator::setStepSize(size);
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getStepSize() const {
+    return lastStepSize > 0 ? lastStepSize : nominalStepSize;
+}
+
+void VariableStepRattleIntegrator::setStepSize(double size) {
+    setNominalStepSize(size);
+}
+
+double VariableStepRattleIntegrator::getMinimumStepSize() const {
+    return minimumStepSize < 0 ? DEFAULT_MINIMUM_FACTOR * nominalStepSize : minimumStepSize;
+}
+
+void VariableStepRattleIntegrator::setMinimumStepSize(double size) {
+    requireBound(size, "minimum step size");
+    checkBounds(nominalStepSize, size, maximumStepSize);
+    minimumStepSize = size;
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getMaximumStepSize() const {
+    return maximumStepSize < 0 ? DEFAULT_MAXIMUM_FACTOR * nominalStepSize : maximumStepSize;
+}
+
+void VariableStepRattleIntegrator::setMaximumStepSize(double size) {
+    requireBound(size, "maximum step size");
+    checkBounds(nominalStepSize, minimumStepSize, size);
+    maximumStepSize = size;
+    settingsChanged();
+}
+
+VariableStepRattleIntegrator::UpdateMethod VariableStepRattleIntegrator::getUpdateMethod() const {
+    return updateMethod;
+}
+
+void VariableStepRattleIntegrator::setUpdateMethod(UpdateMethod method) {
+    if (method < SemiExplicit || method > Bounded)
+        throw OpenMMException(
+            "VariableStepRattleIntegrator: the update method must be SemiExplicit, Explicit or Bounded");
+    updateMethod = method;
+    settingsChanged();
+}
+
+int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, double power) {
+    if (kind < ConstraintMultipliers || kind > ForceGroupEnergy)
+        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor of kind " + std::to_string(kind));
+    requirePositive(weight, "weight of a monitor");
+    requirePositive(power, "power of a monitor");
+    monitors.push_back({kind, weight, power, 0.0});
+    settingsChanged();
+    return (int) monitors.size() - 1;
+}
+
+void VariableStepRattleIntegrator::clearMonitors() {
+    monitors.clear();
+    settingsChanged();
+}
+
+int VariableStepRattleIntegrator::getNumMonitors() const {
+    return (int) monitors.size();
+}
+
+void VariableStepRattleIntegrator::getMonitor(int index, MonitorKind& kind, double& weight, double& power) const {
+    checkMonitorIndex(index);
+    kind = monitors[index].kind;
+    weight = monitors[index].weight;
+    power = monitors[index].power;
+}
+
+int VariableStepRattleIntegrator::getMonitorForceGroup() const {
+    return monitorForceGroup;
+}
+
+void VariableStepRattleIntegrator::setMonitorForceGroup(int group) {
+    if (group < 0 || group > 31)
+        throw OpenMMException("VariableStepRattleIntegrator: the force group of the monitor must lie between 0 and 31, "
+                              "not " +
+                              std::to_string(group));
+    monitorForceGroup = group;
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getNormOrder() const {
+    return normOrder;
+}
+
+void VariableStepRattleIntegrator::setNormOrder(double order) {
+    if (!(order >= 1) || !std::isfinite(order))
+        throw OpenMMException("VariableStepRattleIntegrator: the order of a norm must be a finite number, at least 1");
+    normOrder = order;
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
+    checkMonitorIndex(index);
+    if (context == NULL || monitors[index].reference > 0)
+        return monitors[index].reference;
+    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
+    return stateful.getAs<IntegrateVRattleStepKernel>().getReferenceMonitorValue(*this, index);
+}
+
+void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
+    checkMonitorIndex(index);
+    if (!(value >= 0) || !std::isfinite(value))
+        throw OpenMMException("VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
+                              "number, or 0 to take it at the first step");
+    monitors[index].reference = value;
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getSetReferenceMonitorValue(int index) const {
+    checkMonitorIndex(index);
+    return monitors[index].reference;
+}
+
+void VariableStepRattleIntegrator::calibrate(int steps) {
+    requireContext();
+    if (steps < 1)
+        throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs at least one trial step");
+    if (monitors.empty())
+        throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs a monitor; add one with addMonitor()");
+    vector<double> means = kernel.getAs<IntegrateVRattleStepKernel>().calibrate(*context, *this, steps);
+    for (size_t i = 0; i < monitors.size(); i++)
+        monitors[i].reference = means[i];
+    settingsChanged();
+}
+
+double VariableStepRattleIntegrator::getStepDensity() const {
+    return context == NULL ? 1.0 : kernel.getAs<IntegrateVRattleStepKernel>().getStepDensity();
+}
+
+double VariableStepRattleIntegrator::getMonitorValue(int index) const {
+    requireContext();
+    checkMonitorIndex(index);
+    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
+    return stateful.getAs<IntegrateVRattleStepKernel>().getMonitorValue(*context, *this, index);
+}
+
+vector<double> VariableStepRattleIntegrator::getMultipliers() const {
+    requireContext();
+    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
+    return stateful.getAs<IntegrateVRattleStepKernel>().getMultipliers(*context, *this);
+}
+
+long long VariableStepRattleIntegrator::getNumForceEvaluations() const {
+    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumForceEvaluations();
+}
+
+long long VariableStepRattleIntegrator::getNumSolverIterations() const {
+    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumSolverIterations();
+}
+
+long long VariableStepRattleIntegrator::getNumRescues() const {
+    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumRescues();
+}
+
+void VariableStepRattleIntegrator::setConstraintTolerance(double tol) {
+    requirePositive(tol, "constraint tolerance");
+    Integrator::setConstraintTolerance(tol);
+    settingsChanged();
+}
+
+void VariableStepRattleIntegrator::step(int steps) {
+    requireContext();
+    for (int i = 0; i < steps; i++)
+        lastStepSize = advance(std::numeric_limits<double>::infinity());
+}
+
+void VariableStepRattleIntegrator::stepTo(double time) {
+    requireContext();
+    if (!std::isfinite(time))
+        throw OpenMMException("VariableStepRattleIntegrator: stepTo() needs a finite time");
+    while (time > context->getTime())
+        lastStepSize = advance(time);
+}
+
+double VariableStepRattleIntegrator::advance(double maxTime) {
+    bool forcesInvalid = context->updateContextState();
+    return kernel.getAs<IntegrateVRattleStepKernel>().execute(*context, *this, forcesInvalid, maxTime);
+}
+
+void VariableStepRattleIntegrator::reverse() {
+    requireContext();
+    kernel.getAs<IntegrateVRattleStepKernel>().reverse(*context, *this);
+}
+
+void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
+    checkOpenMMVersion();
+    if (owner != NULL && &contextRef.getOwner() != owner)
+        throw OpenMMException("This Integrator is already bound to a context");
+    OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
+    created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef.getSystem(), *this);
+    context = &contextRef;
+    owner = &contextRef.getOwner();
+    kernel = created;
+    lastStepSize = 0;
+}
+
+void VariableStepRattleIntegrator::cleanup() {
+    kernel = OpenMM::Kernel();
+}
+
+vector<string> VariableStepRattleIntegrator::getKernelNames() {
+    return {IntegrateVRattleStepKernel::Name()};
+}
+
+void VariableStepRattleIntegrator::stateChanged(OpenMM::State::DataType) {
+    kernel.getAs<IntegrateVRattleStepKernel>().stateChanged();
+}
+
+double VariableStepRattleIntegrator::computeKineticEnergy() {
+    return kernel.getAs<IntegrateVRattleStepKernel>().computeKineticEnergy(*context);
+}
+
+bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
+    return false;
+}
+
+void VariableStepRattleIntegrator::settingsChanged() {
+    if (context != NULL)
+        kernel.getAs<IntegrateVRattleStepKernel>().settingsChanged();
+}
+
+void VariableStepRattleIntegrator::requireContext() const {
+    if (context == NULL)
+        throw OpenMMException("This Integrator is not bound to a context!");
+}
+
+void VariableStepRattleIntegrator::checkMonitorIndex(int index) const {
+    if (index < 0 || index >= (int) monitors.size())
+        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
+                              "; the integrator has " + std::to_string(monitors.size()));
+}
+
+void VariableStepRattleIntegrator::checkBounds(double nominal, double minimum, double maximum) const {
+    if (minimum > 0 && minimum >= nominal) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: the minimum step size (" << minimum
+                << " ps) must be smaller than the nominal one (" << nominal << " ps)";
+        throw OpenMMException(message.str());
+    }
+    if (maximum > 0 && maximum <= nominal) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: the maximum step size (" << maximum
+                << " ps) must be larger than the nominal one (" << nominal << " ps)";
+        throw OpenMMException(message.str());
+    }
+}

@@ -1,0 +1,119 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
+#define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
+
+#include "openmm/Vec3.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/** The distance between two particles is fixed: |q1 - q2| = length (nm). */
+struct DistanceConstraint {
+    int particle1, particle2;
+    double length;
+};
+
+/**
+ * The constraints g(q) = 0 of a system of particles, their Jacobian G = dg/dq, and the products with it that the method needs.
+ *
+ * Each distance constraint is written in relative form, g = (|r|^2 - L^2)/(2 L^2) with r = q1 - q2, so that g is the
+ * relative error of the distance and one tolerance serves all. Its row of G is r/L^2 on particle 1 and the opposite on
+ * particle 2. A multiplier of this form is 2 L^2 times the multiplier of |r|^2 - L^2; see toDistanceMultiplier().
+ *
+ * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
+ * neighbours. Constraints between two particles of mass zero cannot move anything and are left out.
+ */
+class ConstraintSystem {
+public:
+    /** The rows of G, one per constraint in internal order: the part that acts on particle 1, 1/nm. */
+    typedef std::vector<OpenMM::Vec3> Jacobian;
+    /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
+    struct Cluster {
+        int first, size;
+    };
+    /** Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column). */
+    struct Coupling {
+        int row, column; // row >= column
+        double factor;   // +-1/mass of the shared particle, or 1/m1 + 1/m2 on the diagonal
+    };
+
+    /**
+     * @param masses         the mass of each particle (amu); 0 for a particle that does not move
+     * @param constraints    the distance constraints
+     */
+    ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+
+    int getNumParticles() const {
+        return (int) masses.size();
+    }
+    int getNumConstraints() const {
+        return (int) constraints.size();
+    }
+    /** The number of constraints that were given to the constructor, with those that were left out. */
+    int getNumGivenConstraints() const {
+        return numGivenConstraints;
+    }
+    const std::vector<double>& getMasses() const {
+        return masses;
+    }
+    /** 1/mass, and 0 for a particle of mass zero. */
+    const std::vector<double>& getInverseMasses() const {
+        return inverseMasses;
+    }
+    const DistanceConstraint& getConstraint(int index) const {
+        return constraints[index];
+    }
+    const std::vector<Cluster>& getClusters() const {
+        return clusters;
+    }
+    const std::vector<Coupling>& getCouplings() const {
+        return couplings;
+    }
+    /** The particles of a cluster, in increasing order. */
+    std::vector<int> getClusterParticles(int cluster) const;
+
+    /** g(q) in g; returns max |g|, the largest relative error of a constraint (or a NaN). */
+    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g) const;
+    /** The index of the constraint with the largest |g|. */
+    int findLargest(const std::vector<double>& g) const;
+    /**
+     * G(x): for x = q the Jacobian, for x = v the matrix whose rows are (d^2g/dq^2 v)^T, since a distance constraint
+     * is quadratic (paper, Lemma 4.1).
+     */
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian) const;
+    /** G w. */
+    void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result) const;
+    /** G M^-1 f. */
+    void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f,
+                          std::vector<double>& result) const;
+    /** result += G^T x, as forces on the particles. */
+    void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
+    /** result += scale M^-1 G^T x. */
+    void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
+                               std::vector<OpenMM::Vec3>& result) const;
+    /** g''(v,v), the second derivative of the constraints along v. */
+    void evaluateCurvature(const std::vector<OpenMM::Vec3>& v, std::vector<double>& result) const;
+    /** The factor that turns a multiplier of constraint index into that of |r|^2 - L^2 (kJ/mol/nm^2). */
+    double toDistanceMultiplier(int index) const {
+        return distanceMultiplierFactors[index];
+    }
+    /** Bring multipliers into the order of the constructor and the units kJ/mol/nm^2. */
+    void getDistanceMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
+
+private:
+    void findClusters(const std::vector<DistanceConstraint>& given, const std::vector<int>& active);
+    void findCouplings();
+    int numGivenConstraints;
+    std::vector<double> masses, inverseMasses;
+    std::vector<DistanceConstraint> constraints;
+    std::vector<int> givenIndex; // internal order -> order of the constructor
+    std::vector<double> inverseSquareLengths, distanceMultiplierFactors;
+    std::vector<Cluster> clusters;
+    std::vector<Coupling> couplings;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_CONSTRAINTSYSTEM_H_

@@ -1,0 +1,41 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_STEPFAILURE_H_
+#define OPENMMVRATTLE_STEPFAILURE_H_
+
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/** A step, or the start of a run, could not be completed. The state before it is untouched. */
+class StepFailure : public std::runtime_error {
+public:
+    /** @param reason    what happened, as the end of the sentence "the step failed because ..." */
+    explicit StepFailure(const std::string& reason) : std::runtime_error(reason) {
+    }
+};
+
+/** The constraints among some particles depend on each other, so that their multipliers are not defined. */
+class DependentConstraints : public StepFailure {
+public:
+    explicit DependentConstraints(const std::vector<int>& particles) : StepFailure(describe(particles)) {
+    }
+
+private:
+    static std::string describe(const std::vector<int>& particles) {
+        const size_t maxListed = 12;
+        std::string text = "the constraints among the particles ";
+        for (size_t i = 0; i < particles.size() && i < maxListed; i++)
+            text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
+        if (particles.size() > maxListed)
+            text += ", ... (" + std::to_string(particles.size()) + " in all)";
+        return text + " are redundant or nearly so in the current configuration; remove one of them";
+    }
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_STEPFAILURE_H_

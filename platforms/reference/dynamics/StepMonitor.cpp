@@ -1,0 +1,268 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "StepMonitor.h"
+#include <algorithm>
+#include <cmath>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+// (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
+template <class Size> double pNorm(int count, double order, Size size) {
+    double largest = 0;
+    for (int i = 0; i < count; i++)
+        largest = std::max(largest, size(i));
+    if (largest == 0)
+        return 0;
+    double sum = 0;
+    for (int i = 0; i < count; i++)
+        sum += std::pow(size(i) / largest, order);
+    return largest * std::pow(sum, 1 / order);
+}
+
+bool usesMultipliers(StepMonitor::Kind kind) {
+    return kind == StepMonitor::ConstraintMultipliers || kind == StepMonitor::ConstraintForce ||
+           kind == StepMonitor::ConstraintAndAppliedForce || kind == StepMonitor::MultiplierPNorm;
+}
+
+bool usesVelocities(StepMonitor::Kind kind) {
+    return kind == StepMonitor::VectorField || kind == StepMonitor::ArcLength ||
+           kind == StepMonitor::MaxParticleArcLength;
+}
+
+} // namespace
+
+StepMonitor::StepMonitor(const ConstraintSystem& system) :
+        system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
+        maxForce(0), forcePNorm(0), constraintForceSquared(0), constraintForces(system.getNumParticles()),
+        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
+        velocityJacobian(system.getNumConstraints()) {
+}
+
+void StepMonitor::setTerms(const vector<Term>& newTerms, double order) {
+    terms = newTerms;
+    normOrder = order;
+}
+
+bool StepMonitor::needsMultipliers() const {
+    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesMultipliers(term.kind); });
+}
+
+bool StepMonitor::dependsOnVelocities() const {
+    return std::any_of(terms.begin(), terms.end(), [](const Term& term) {
+        return usesMultipliers(term.kind) || usesVelocities(term.kind);
+    });
+}
+
+void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
+    forces = &newForces;
+    groupEnergy = energy;
+    appliedForceSquared = forceSquared = maxForce = forcePNorm = 0;
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    bool needsPNorm = false;
+    for (const Term& term : terms)
+        needsPNorm |= term.kind == ForcePNorm;
+    for (int i = 0; i < system.getNumParticles(); i++)
+        if (inverseMasses[i] > 0) {
+            double square = newForces[i].dot(newForces[i]);
+            appliedForceSquared += square * inverseMasses[i];
+            forceSquared += square;
+            maxForce = std::max(maxForce, square);
+        }
+    maxForce = std::sqrt(maxForce);
+    if (needsPNorm)
+        forcePNorm = pNorm(system.getNumParticles(), normOrder, [&](int i) {
+            return inverseMasses[i] > 0 ? std::sqrt(newForces[i].dot(newForces[i])) : 0.0;
+        });
+}
+
+void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers,
+                           const ConstraintSystem::Jacobian& jacobian, vector<double>& values) {
+    bool needsConstraintForce = false;
+    for (const Term& term : terms)
+        needsConstraintForce |= term.kind == ConstraintForce || term.kind == ConstraintAndAppliedForce;
+    if (needsConstraintForce) {
+        // Lambda^T K Lambda = |M^-1/2 G^T Lambda|^2
+        std::fill(constraintForces.begin(), constraintForces.end(), Vec3());
+        system.addTransposed(jacobian, multipliers, constraintForces);
+        constraintForceSquared = 0;
+        for (int i = 0; i < system.getNumParticles(); i++)
+            constraintForceSquared += constraintForces[i].dot(constraintForces[i]) * system.getInverseMasses()[i];
+    }
+    values.resize(terms.size());
+    for (size_t i = 0; i < terms.size(); i++)
+        values[i] = evaluateTerm(terms[i], v, multipliers);
+}
+
+double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const vector<double>& multipliers) {
+    const vector<double>& masses = system.getMasses();
+    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+    auto distanceMultiplier = [&](int k) { return multipliers[k] * system.toDistanceMultiplier(k); };
+    switch (term.kind) {
+    case ConstraintMultipliers: { // (4.4)
+        double sum = 0;
+        for (int k = 0; k < numConstraints; k++)
+            sum += distanceMultiplier(k) * distanceMultiplier(k);
+        return std::sqrt(sum);
+    }
+    case ConstraintForce:
+        return std::sqrt(constraintForceSquared);
+    case AppliedForce:
+        return std::sqrt(appliedForceSquared);
+    case ConstraintAndAppliedForce:
+        return std::sqrt(constraintForceSquared + appliedForceSquared);
+    case MultiplierPNorm:
+        return pNorm(numConstraints, normOrder, [&](int k) { return std::fabs(distanceMultiplier(k)); });
+    case ForcePNorm:
+        return forcePNorm;
+    case VectorField: { // (4.1)
+        double sum = forceSquared;
+        for (int i = 0; i < numParticles; i++)
+            sum += masses[i] * v[i].dot(v[i]);
+        return std::sqrt(sum);
+    }
+    case MaxForce:
+        return maxForce;
+    case ArcLength: {
+        double sum = forceSquared;
+        for (int i = 0; i < numParticles; i++)
+            if (masses[i] > 0)
+                sum += v[i].dot(v[i]);
+        return std::sqrt(sum);
+    }
+    case MaxParticleArcLength: {
+        double largest = 0;
+        for (int i = 0; i < numParticles; i++)
+            if (masses[i] > 0)
+                largest = std::max(largest, v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]));
+        return std::sqrt(largest);
+    }
+    case ForceGroupEnergy:
+        return groupEnergy;
+    }
+    return 0;
+}
+
+bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v) const {
+    if (!(value > 0))
+        return true;
+    Kind kind = terms[index].kind;
+    if (kind != ConstraintMultipliers && kind != MultiplierPNorm && kind != ConstraintForce)
+        return false;
+    // Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
+    double largest = 0;
+    for (int k = 0; k < system.getNumConstraints(); k++) {
+        const DistanceConstraint& c = system.getConstraint(k);
+        for (int i : {c.particle1, c.particle2}) {
+            double speedSquared = v[i].dot(v[i]), inverseMass = system.getInverseMasses()[i];
+            if (inverseMass > 0) {
+                double force = std::sqrt((*forces)[i].dot((*forces)[i])) + speedSquared / (inverseMass * c.length);
+                largest = std::max(largest, kind == ConstraintForce ? force * std::sqrt(inverseMass)
+                                                                    : force / (2 * c.length));
+            }
+        }
+    }
+    return value <= 1e-12 * largest;
+}
+
+double StepMonitor::combine(const vector<double>& values) const {
+    if (terms.empty())
+        return 1;
+    double sum = 0, sumOfWeights = 0;
+    for (size_t i = 0; i < terms.size(); i++) {
+        double t = terms[i].weight * std::pow(values[i] / terms[i].reference, terms[i].power);
+        sum += t * t;
+        sumOfWeights += terms[i].weight * terms[i].weight;
+    }
+    return std::sqrt(sum / sumOfWeights);
+}
+
+void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& multipliers,
+                                   const vector<double>& values, const ConstraintMatrix& matrix,
+                                   vector<Vec3>& gradient) {
+    const vector<double>& masses = system.getMasses();
+    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+    std::fill(gradient.begin(), gradient.end(), Vec3());
+    // du/dLambda is collected in two parts: y, which needs a product with K^-1, and x, which is K^-1 du/dLambda already.
+    std::fill(toSolve.begin(), toSolve.end(), 0.0);
+    std::fill(solved.begin(), solved.end(), 0.0);
+    bool mustSolve = false;
+    const double u = combine(values);
+    double sumOfWeights = 0;
+    for (const Term& term : terms)
+        sumOfWeights += term.weight * term.weight;
+    for (size_t i = 0; i < terms.size(); i++) {
+        const Term& term = terms[i];
+        const double value = values[i];
+        if (!(value > 0) || !(u > 0))
+            continue; // U is not differentiable at zero; any value serves, since it only guides the iteration
+        double t = term.weight * std::pow(value / term.reference, term.power);
+        const double factor = t * t * term.power / (value * u * sumOfWeights); // du/dU_k
+        switch (term.kind) {
+        case ConstraintMultipliers:
+            mustSolve = true;
+            for (int k = 0; k < numConstraints; k++) {
+                double d = system.toDistanceMultiplier(k);
+                toSolve[k] += factor / value * d * d * multipliers[k];
+            }
+            break;
+        case MultiplierPNorm:
+            mustSolve = true;
+            for (int k = 0; k < numConstraints; k++) {
+                double d = system.toDistanceMultiplier(k), size = std::fabs(d * multipliers[k]);
+                double derivative = d * std::pow(size / value, normOrder - 1);
+                toSolve[k] += factor * (multipliers[k] < 0 ? -derivative : derivative);
+            }
+            break;
+        case ConstraintForce:
+        case ConstraintAndAppliedForce:
+            // dU/dLambda = K Lambda/U
+            for (int k = 0; k < numConstraints; k++)
+                solved[k] += factor / value * multipliers[k];
+            break;
+        case VectorField:
+            for (int p = 0; p < numParticles; p++)
+                gradient[p] += v[p] * (factor / value * masses[p]);
+            break;
+        case ArcLength:
+            for (int p = 0; p < numParticles; p++)
+                if (masses[p] > 0)
+                    gradient[p] += v[p] * (factor / value);
+            break;
+        case MaxParticleArcLength: {
+            int largest = 0;
+            double largestSquare = -1;
+            for (int p = 0; p < numParticles; p++) {
+                double square = v[p].dot(v[p]) + (*forces)[p].dot((*forces)[p]);
+                if (masses[p] > 0 && square > largestSquare) {
+                    largestSquare = square;
+                    largest = p;
+                }
+            }
+            gradient[largest] += v[largest] * (factor / value);
+            break;
+        }
+        case AppliedForce:
+        case ForcePNorm:
+        case MaxForce:
+        case ForceGroupEnergy:
+            break;
+        }
+    }
+    if (!needsMultipliers())
+        return;
+    if (mustSolve) {
+        matrix.solve(toSolve);
+        for (int k = 0; k < numConstraints; k++)
+            solved[k] += toSolve[k];
+    }
+    // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
+    system.evaluateJacobian(v, velocityJacobian);
+    for (double& x : solved)
+        x *= 2;
+    system.addTransposed(velocityJacobian, solved, gradient);
+}

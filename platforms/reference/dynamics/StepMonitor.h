@@ -1,0 +1,111 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_STEPMONITOR_H_
+#define OPENMMVRATTLE_STEPMONITOR_H_
+
+#include "ConstraintMatrix.h"
+#include "ConstraintSystem.h"
+#include "openmm/Vec3.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The monitors U_k(q,p) of METHOD section 4, their combination
+ *
+ *     u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2),
+ *
+ * and the derivative of u with respect to the velocities, at fixed positions. A monitor sees q only through the applied
+ * force F, through the multipliers Lambda(q,p) and through the energy of a force group.
+ */
+class StepMonitor {
+public:
+    enum Kind {
+        ConstraintMultipliers,
+        ConstraintForce,
+        AppliedForce,
+        ConstraintAndAppliedForce,
+        MultiplierPNorm,
+        ForcePNorm,
+        VectorField,
+        MaxForce,
+        ArcLength,
+        MaxParticleArcLength,
+        ForceGroupEnergy
+    };
+    struct Term {
+        Kind kind;
+        double weight, power;
+        double reference; // U_k,ref; 0 while it is not known
+    };
+
+    explicit StepMonitor(const ConstraintSystem& system);
+    void setTerms(const std::vector<Term>& terms, double normOrder);
+    const std::vector<Term>& getTerms() const {
+        return terms;
+    }
+    void setReference(int index, double value) {
+        terms[index].reference = value;
+    }
+    bool isEmpty() const {
+        return terms.empty();
+    }
+    /** Whether any term needs the multipliers, that is, constraints. */
+    bool needsMultipliers() const;
+    /** Whether any term changes with the velocities at fixed positions. */
+    bool dependsOnVelocities() const;
+
+    /**
+     * Take over the forces at new positions, on which the following evaluations are based.
+     *
+     * @param forces         the applied force on each particle (kJ/mol/nm)
+     * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
+     */
+    void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** The forces of the last setForces() now lie elsewhere. */
+    void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
+        forces = &newForces;
+    }
+    /**
+     * U_k at velocities v, for every term.
+     *
+     * @param v              the velocities (nm/ps)
+     * @param multipliers    Lambda(q,p) at these velocities
+     * @param jacobian       G(q)
+     * @param values         U_k
+     */
+    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                  const ConstraintSystem::Jacobian& jacobian, std::vector<double>& values);
+    /** Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls. */
+    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v) const;
+    /** u, the combination of the values; 1 if there is no term. */
+    double combine(const std::vector<double>& values) const;
+    /**
+     * du/dv at the state of the last evaluate().
+     *
+     * @param v              as in evaluate()
+     * @param multipliers    as in evaluate()
+     * @param values         what evaluate() gave
+     * @param matrix         the factorised K(q)
+     * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
+     */
+    void evaluateGradient(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                          const std::vector<double>& values, const ConstraintMatrix& matrix,
+                          std::vector<OpenMM::Vec3>& gradient);
+
+private:
+    double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers);
+    const ConstraintSystem& system;
+    std::vector<Term> terms;
+    double normOrder;
+    const std::vector<OpenMM::Vec3>* forces;
+    double groupEnergy, appliedForceSquared, forceSquared, maxForce, forcePNorm, constraintForceSquared;
+    std::vector<OpenMM::Vec3> constraintForces;
+    std::vector<double> toSolve, solved;
+    ConstraintSystem::Jacobian velocityJacobian;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_STEPMONITOR_H_

@@ -1,0 +1,196 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_VRATTLEDYNAMICS_H_
+#define OPENMMVRATTLE_VRATTLEDYNAMICS_H_
+
+#include "ConstraintMatrix.h"
+#include "ConstraintSystem.h"
+#include "NewtonMatrix.h"
+#include "StepDensity.h"
+#include "StepFailure.h"
+#include "StepMonitor.h"
+#include "openmm/Vec3.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The method VRATTLE, equations (3.9)-(3.14) of Barth, Leimkuhler and Reich, for a system of particles whose forces
+ * somebody else computes. It knows no Context, no Kernel and no Platform.
+ *
+ * A step is made in two halves, around the one evaluation of the forces that it costs:
+ *
+ *     dynamics.step(maxStep);                  // (3.9)-(3.11), (3.14): new positions, getNextPositions()
+ *     ... compute the forces there ...
+ *     dynamics.finish(forces, groupEnergy);    // (3.12)-(3.13): new on-step velocities; the step is complete
+ *
+ * Until finish() has returned, the state before the step is untouched. Momenta are kept as velocities: v stands for
+ * M^-1 p[n], w for M^-1 p[n-1/2].
+ */
+class VRattleDynamics {
+public:
+    /** What a user can choose. */
+    struct Settings {
+        double stepSize;                      // the nominal step h (ps)
+        double minimumStep, maximumStep;      // bounds (ps), 0 for none
+        double tolerance;                     // of the constraints, relative
+        StepDensity::Update update;
+        std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
+        double normOrder;
+        bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
+    };
+
+    VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+
+    /**
+     * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
+     * half-step momentum is formed anew.
+     *
+     * @throws StepFailure    if a monitor needs constraints and there are none
+     */
+    void setSettings(const Settings& settings);
+
+    /**
+     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
+     * those that do so to the tolerance are left as they are.
+     *
+     * @return whether the positions were changed
+     * @throws StepFailure    if there is no such configuration nearby
+     */
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
+    /** Start afresh at a state. The velocities are projected onto the constraints. */
+    void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
+    void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Go on with changed velocities at the same positions; as changeState(). */
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
+
+    /**
+     * The first half of a step.
+     *
+     * @param maxStep    the step must not be longer than this (ps); a shortened step goes on with the same density
+     * @return the size of the step (ps)
+     * @throws StepFailure    if the equations of the step have no solution that the iteration finds
+     */
+    double step(double maxStep);
+    /**
+     * The second half of a step.
+     *
+     * @param forces         the applied forces at getNextPositions()
+     * @param groupEnergy    the energy of the monitor's force group there
+     * @return whether the step is complete. If not, the state is as before step(), the density of the first step is now known
+     *         better, and both halves are to be done again. This happens once, at a start with given reference values.
+     * @throws StepFailure    if the forces are not finite or the constraints have become dependent
+     */
+    bool finish(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Turn time around, without a force. */
+    void reverse();
+
+    const ConstraintSystem& getConstraintSystem() const {
+        return system;
+    }
+    /** q[n]. */
+    const std::vector<OpenMM::Vec3>& getPositions() const {
+        return q;
+    }
+    /** q[n+1], after step(). */
+    const std::vector<OpenMM::Vec3>& getNextPositions() const {
+        return qNext;
+    }
+    /** M^-1 p[n]. */
+    const std::vector<OpenMM::Vec3>& getVelocities() const {
+        return v;
+    }
+    /** F(q[n]). */
+    const std::vector<OpenMM::Vec3>& getForces() const {
+        return force;
+    }
+    /** The energy of the monitor's force group at q[n]. */
+    double getGroupEnergy() const {
+        return groupEnergy;
+    }
+    /** rho[n-1/2]. */
+    double getDensity() const {
+        return rho;
+    }
+    /** U_k(q[n],p[n]). */
+    const std::vector<double>& getMonitorValues() const {
+        return values;
+    }
+    /** U_k,ref, 0 while it is not known. */
+    double getReference(int index) const {
+        return monitor.getTerms()[index].reference;
+    }
+    /** Lambda(q[n],p[n]) for the relative form of the constraints, in internal order. */
+    const std::vector<double>& getMultipliers() const {
+        return lambda;
+    }
+    long long getNumIterations() const {
+        return numIterations;
+    }
+    long long getNumRescues() const {
+        return numRescues;
+    }
+
+private:
+    enum StepKind { Regular, First, Shortened };
+    enum SolveResult { Converged, NotConverged, NotPositive };
+    void requireConstraintsForMonitors() const;
+    void factorizeAt(const std::vector<OpenMM::Vec3>& positions);
+    void restoreFactor();
+    void forgetDensity();
+    void rescaleDensity(double oldU);
+    double combineAndLimit(const std::vector<double>& monitorValues) const;
+    void formHalfStepVelocities();
+    void computeMultipliers(const std::vector<OpenMM::Vec3>& velocities, std::vector<double>& result) const;
+    double evaluateU(const std::vector<OpenMM::Vec3>& velocities);
+    void projectVelocities(std::vector<OpenMM::Vec3>& velocities) const;
+    void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
+                        const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
+                        std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
+                        std::vector<double>& monitorValues);
+    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    SolveResult solveCoupled();
+    double solveRegular();
+    [[noreturn]] void throwNotConverged() const;
+    bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
+    bool startDensityFrom(const std::vector<double>& backValues, bool hasBack);
+    static double startValue(double start, double ahead, const double* back);
+
+    ConstraintSystem system;
+    ConstraintMatrix matrix;
+    NewtonMatrix newtonMatrix;
+    StepMonitor monitor;
+    StepDensity density;
+    Settings settings;
+
+    // The state between two steps.
+    std::vector<OpenMM::Vec3> q, v, w, force;
+    double groupEnergy, rho, u;
+    std::vector<double> lambda, values, appliedTerm; // appliedTerm: G M^-1 F
+    ConstraintSystem::Jacobian jacobian;             // G(q[n]), to which the factor of the matrix belongs
+    bool hasDensity, isFactorCurrent;
+    double firstDensity; // of the first step, once it is known; else 0
+
+    // The step in progress.
+    StepKind stepKind;
+    std::vector<OpenMM::Vec3> qNext, wNext, vNext, forceNext, acceleration, gradient, halfStepChange;
+    double rhoNext, stepNext, kickNext;
+    std::vector<double> lambdaNext, valuesNext, multiplierTrial, residual, correction, coupling, response;
+    ConstraintSystem::Jacobian jacobianNext;
+
+    // Work space of the start.
+    std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
+    std::vector<double> lambdaBack;
+
+    long long numIterations, numRescues;
+    double lastError; // the largest relative error of a constraint that the last iteration left
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_VRATTLEDYNAMICS_H_

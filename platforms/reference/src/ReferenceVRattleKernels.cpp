@@ -1,0 +1,310 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "ReferenceVRattleKernels.h"
+#include "openmm/OpenMMException.h"
+#include "openmm/internal/ContextImpl.h"
+#include <cmath>
+#include <limits>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using OpenMM::ContextImpl;
+using OpenMM::OpenMMException;
+using OpenMM::System;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+const int NO_MONITOR_GROUP = -1;
+
+[[noreturn]] void throwFailure(const std::string& what, double time, const std::string& reason,
+                               const std::string& wayOut) {
+    std::stringstream message;
+    message.precision(10);
+    message << "VariableStepRattleIntegrator: " << what << " at t = " << time << " ps failed because " << reason << wayOut;
+    throw OpenMMException(message.str());
+}
+
+void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, const std::string& name) {
+    for (size_t i = 0; i < vectors.size(); i++)
+        for (int j = 0; j < 3; j++)
+            if (!std::isfinite(vectors[i][j]) && masses[i] > 0)
+                throw OpenMMException("VariableStepRattleIntegrator: the " + name + " of particle " + std::to_string(i) +
+                                      " is not a finite number; set it before stepping");
+}
+
+} // namespace
+
+void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
+                                                     const VariableStepRattleIntegrator& integrator) {
+    masses.resize(system.getNumParticles());
+    for (int i = 0; i < system.getNumParticles(); i++)
+        masses[i] = system.getParticleMass(i);
+    constraints.resize(system.getNumConstraints());
+    for (int i = 0; i < system.getNumConstraints(); i++) {
+        DistanceConstraint& c = constraints[i];
+        system.getConstraintParameters(i, c.particle1, c.particle2, c.length);
+        if (!(c.length > 0) || !std::isfinite(c.length))
+            throw OpenMMException("VariableStepRattleIntegrator: constraint " + std::to_string(i) +
+                                  " of the System has a length that is not a positive finite number");
+    }
+    dynamics.reset(new VRattleDynamics(masses, constraints));
+    forceGroups = 0;
+    monitorForceGroup = NO_MONITOR_GROUP;
+    areSettingsChanged = isStateChanged = true;
+    lastDensity = 1;
+    numForceEvaluations = 0;
+    readSettings(integrator);
+}
+
+void ReferenceIntegrateVRattleStepKernel::settingsChanged() {
+    areSettingsChanged = true;
+}
+
+void ReferenceIntegrateVRattleStepKernel::stateChanged() {
+    isStateChanged = true;
+}
+
+void ReferenceIntegrateVRattleStepKernel::readSettings(const VariableStepRattleIntegrator& integrator) {
+    settings.stepSize = integrator.getNominalStepSize();
+    settings.minimumStep = integrator.getMinimumStepSize();
+    settings.maximumStep = integrator.getMaximumStepSize();
+    settings.tolerance = integrator.getConstraintTolerance();
+    settings.update = (StepDensity::Update) integrator.getUpdateMethod();
+    settings.normOrder = integrator.getNormOrder();
+    settings.isFixedStep = false;
+    settings.terms.clear();
+    int group = NO_MONITOR_GROUP;
+    for (int i = 0; i < integrator.getNumMonitors(); i++) {
+        VariableStepRattleIntegrator::MonitorKind kind;
+        StepMonitor::Term term;
+        integrator.getMonitor(i, kind, term.weight, term.power);
+        term.kind = (StepMonitor::Kind) kind;
+        term.reference = integrator.getSetReferenceMonitorValue(i);
+        settings.terms.push_back(term);
+        if (kind == VariableStepRattleIntegrator::ForceGroupEnergy)
+            group = integrator.getMonitorForceGroup();
+    }
+    if (group != monitorForceGroup) {
+        monitorForceGroup = group;
+        isStateChanged = true;
+    }
+    try {
+        dynamics->setSettings(settings);
+    }
+    catch (const StepFailure& failure) {
+        throw OpenMMException(std::string("VariableStepRattleIntegrator: ") + failure.what());
+    }
+    areSettingsChanged = false;
+}
+
+// Bring the method's state in line with the Context, which may have been changed in between.
+void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                                                  bool forcesInvalid) {
+    if (areSettingsChanged)
+        readSettings(integrator);
+    int groups = integrator.getIntegrationForceGroups();
+    if (monitorForceGroup != NO_MONITOR_GROUP)
+        groups &= ~(1 << monitorForceGroup);
+    if (groups != forceGroups) {
+        forceGroups = groups;
+        isStateChanged = true;
+    }
+    forcesInvalid |= haveBoxVectorsChanged();
+    try {
+        if (isStateChanged)
+            startAfresh(context);
+        else if (forcesInvalid || differ(*data.positions, dynamics->getPositions())) {
+            // A Force has changed the state (a barostat, say).
+            isStateChanged = true;
+            double energy = computeForces(context);
+            dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
+            writeMoving(dynamics->getVelocities(), *data.velocities);
+        }
+        else if (differ(*data.velocities, dynamics->getVelocities())) {
+            dynamics->changeVelocities(*data.velocities);
+            writeMoving(dynamics->getVelocities(), *data.velocities);
+        }
+        isStateChanged = false;
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("the start", data.time, failure.what(), "");
+    }
+}
+
+void ReferenceIntegrateVRattleStepKernel::startAfresh(ContextImpl& context) {
+    requireFinite(*data.positions, masses, "position");
+    requireFinite(*data.velocities, masses, "velocity");
+    vector<Vec3> positions = *data.positions;
+    if (dynamics->projectPositions(positions)) {
+        writeMoving(positions, *data.positions);
+        context.computeVirtualSites();
+    }
+    double energy = computeForces(context);
+    dynamics->begin(*data.positions, *data.velocities, *data.forces, energy);
+    writeMoving(dynamics->getVelocities(), *data.velocities);
+}
+
+double ReferenceIntegrateVRattleStepKernel::computeForces(ContextImpl& context) {
+    context.calcForcesAndEnergy(true, false, forceGroups);
+    numForceEvaluations++;
+    return monitorForceGroup == NO_MONITOR_GROUP ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
+}
+
+bool ReferenceIntegrateVRattleStepKernel::haveBoxVectorsChanged() {
+    bool changed = false;
+    for (int i = 0; i < 3; i++) {
+        changed |= boxVectors[i] != data.periodicBoxVectors[i];
+        boxVectors[i] = data.periodicBoxVectors[i];
+    }
+    return changed;
+}
+
+// Particles of mass zero are not the integrator's to move: they are virtual sites, or fixed.
+bool ReferenceIntegrateVRattleStepKernel::differ(const vector<Vec3>& a, const vector<Vec3>& b) const {
+    for (size_t i = 0; i < masses.size(); i++)
+        if (masses[i] > 0 && a[i] != b[i])
+            return true;
+    return false;
+}
+
+void ReferenceIntegrateVRattleStepKernel::writeMoving(const vector<Vec3>& from, vector<Vec3>& to) const {
+    for (size_t i = 0; i < masses.size(); i++)
+        if (masses[i] > 0)
+            to[i] = from[i];
+}
+
+// One step of the method in the Context, the velocities and the time excepted.
+double ReferenceIntegrateVRattleStepKernel::advance(ContextImpl& context, VRattleDynamics& method, double maxStep) {
+    while (true) {
+        double size = method.step(maxStep);
+        writeMoving(method.getNextPositions(), *data.positions);
+        context.computeVirtualSites();
+        double energy = computeForces(context);
+        if (method.finish(*data.forces, energy))
+            return size;
+    }
+}
+
+void ReferenceIntegrateVRattleStepKernel::putBack(ContextImpl& context) {
+    writeMoving(dynamics->getPositions(), *data.positions);
+    context.computeVirtualSites();
+    *data.forces = dynamics->getForces();
+}
+
+double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                                                    bool forcesInvalid, double maxTime) {
+    prepare(context, integrator, forcesInvalid);
+    const double maxStep = maxTime - data.time;
+    double size;
+    try {
+        size = advance(context, *dynamics, maxStep);
+    }
+    catch (const StepFailure& failure) {
+        putBack(context);
+        throwFailure("the step", data.time, failure.what(),
+                     "; the Context is in the state before this step: use a smaller step size, or another monitor");
+    }
+    catch (...) {
+        putBack(context);
+        throw;
+    }
+    writeMoving(dynamics->getVelocities(), *data.velocities);
+    lastDensity = dynamics->getDensity();
+    data.time = size < maxStep ? data.time + size : maxTime;
+    data.stepCount++;
+    return size;
+}
+
+void ReferenceIntegrateVRattleStepKernel::reverse(ContextImpl& context,
+                                                  const VariableStepRattleIntegrator& integrator) {
+    prepare(context, integrator, false);
+    try {
+        dynamics->reverse();
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("reverse()", data.time, failure.what(), "; the Context is unchanged");
+    }
+    lastDensity = dynamics->getDensity();
+    writeMoving(dynamics->getVelocities(), *data.velocities);
+}
+
+vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& context,
+                                                              const VariableStepRattleIntegrator& integrator,
+                                                              int steps) {
+    prepare(context, integrator, false);
+    VRattleDynamics trial(masses, constraints);
+    VRattleDynamics::Settings fixed = settings;
+    fixed.isFixedStep = true;
+    vector<double> means(settings.terms.size(), 0.0);
+    try {
+        trial.setSettings(fixed);
+        trial.begin(dynamics->getPositions(), dynamics->getVelocities(), dynamics->getForces(),
+                    dynamics->getGroupEnergy());
+        for (int i = 0; i < steps; i++) {
+            advance(context, trial, std::numeric_limits<double>::infinity());
+            for (size_t k = 0; k < means.size(); k++)
+                means[k] += trial.getMonitorValues()[k] / steps;
+        }
+    }
+    catch (const StepFailure& failure) {
+        putBack(context);
+        throwFailure("calibrate()", data.time, failure.what(), "; the Context is unchanged: use a smaller step size");
+    }
+    catch (...) {
+        putBack(context);
+        throw;
+    }
+    putBack(context);
+    for (size_t k = 0; k < means.size(); k++)
+        if (!(means[k] > 0))
+            throw OpenMMException("VariableStepRattleIntegrator: monitor " + std::to_string(k) +
+                                  " is zero all along the trial run of calibrate(); choose another monitor");
+    return means;
+}
+
+double ReferenceIntegrateVRattleStepKernel::computeKineticEnergy(ContextImpl&) {
+    double sum = 0;
+    for (size_t i = 0; i < masses.size(); i++)
+        sum += masses[i] * (*data.velocities)[i].dot((*data.velocities)[i]);
+    return 0.5 * sum;
+}
+
+double ReferenceIntegrateVRattleStepKernel::getStepDensity() const {
+    return lastDensity;
+}
+
+double ReferenceIntegrateVRattleStepKernel::getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator,
+                                                                     int index) {
+    if (areSettingsChanged)
+        readSettings(integrator);
+    return dynamics->getReference(index);
+}
+
+double ReferenceIntegrateVRattleStepKernel::getMonitorValue(ContextImpl& context,
+                                                            const VariableStepRattleIntegrator& integrator, int index) {
+    prepare(context, integrator, false);
+    return dynamics->getMonitorValues()[index];
+}
+
+vector<double> ReferenceIntegrateVRattleStepKernel::getMultipliers(ContextImpl& context,
+                                                                   const VariableStepRattleIntegrator& integrator) {
+    prepare(context, integrator, false);
+    vector<double> result;
+    dynamics->getConstraintSystem().getDistanceMultipliers(dynamics->getMultipliers(), result);
+    return result;
+}
+
+long long ReferenceIntegrateVRattleStepKernel::getNumForceEvaluations() const {
+    return numForceEvaluations;
+}
+
+long long ReferenceIntegrateVRattleStepKernel::getNumSolverIterations() const {
+    return dynamics->getNumIterations();
+}
+
+long long ReferenceIntegrateVRattleStepKernel::getNumRescues() const {
+    return dynamics->getNumRescues();
+}

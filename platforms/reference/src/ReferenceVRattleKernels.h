@@ -1,0 +1,68 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
+#define OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
+
+#include "VRattleDynamics.h"
+#include "openmm/reference/ReferencePlatform.h"
+#include "openmmvrattle/VRattleKernels.h"
+#include <memory>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The kernel for the Reference platform and those derived from it (CPU). It moves data between the Context and
+ * VRattleDynamics and asks for the forces.
+ */
+class ReferenceIntegrateVRattleStepKernel : public IntegrateVRattleStepKernel {
+public:
+    ReferenceIntegrateVRattleStepKernel(const std::string& name, const OpenMM::Platform& platform,
+                                        OpenMM::ReferencePlatform::PlatformData& data) :
+            IntegrateVRattleStepKernel(name, platform), data(data) {
+    }
+    void initialize(const OpenMM::System& system, const VariableStepRattleIntegrator& integrator) override;
+    void settingsChanged() override;
+    void stateChanged() override;
+    double execute(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid,
+                   double maxTime) override;
+    void reverse(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator) override;
+    std::vector<double> calibrate(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                                  int steps) override;
+    double computeKineticEnergy(OpenMM::ContextImpl& context) override;
+    double getStepDensity() const override;
+    double getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator, int index) override;
+    double getMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                           int index) override;
+    std::vector<double> getMultipliers(OpenMM::ContextImpl& context,
+                                       const VariableStepRattleIntegrator& integrator) override;
+    long long getNumForceEvaluations() const override;
+    long long getNumSolverIterations() const override;
+    long long getNumRescues() const override;
+
+private:
+    void readSettings(const VariableStepRattleIntegrator& integrator);
+    void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
+    void startAfresh(OpenMM::ContextImpl& context);
+    double advance(OpenMM::ContextImpl& context, VRattleDynamics& method, double maxStep);
+    void putBack(OpenMM::ContextImpl& context);
+    double computeForces(OpenMM::ContextImpl& context);
+    bool haveBoxVectorsChanged();
+    bool differ(const std::vector<OpenMM::Vec3>& a, const std::vector<OpenMM::Vec3>& b) const;
+    void writeMoving(const std::vector<OpenMM::Vec3>& from, std::vector<OpenMM::Vec3>& to) const;
+    OpenMM::ReferencePlatform::PlatformData& data;
+    std::vector<double> masses;
+    std::vector<DistanceConstraint> constraints;
+    std::unique_ptr<VRattleDynamics> dynamics;
+    VRattleDynamics::Settings settings;
+    OpenMM::Vec3 boxVectors[3];
+    int forceGroups, monitorForceGroup;
+    bool areSettingsChanged, isStateChanged;
+    double lastDensity;
+    long long numForceEvaluations;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
