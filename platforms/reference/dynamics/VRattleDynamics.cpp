@@ -18,6 +18,10 @@ const int MAX_ITERATIONS = 50;
 const double SLOW_CONVERGENCE = 0.25;
 // The density equation (3.14) is solved to this relative accuracy; rounding of U allows little more.
 const double DENSITY_TOLERANCE = 1e-12;
+// The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
+// starting value is worse by a power of h, to this. What is left is not the same forwards and backwards, and so limits
+// how closely a run can be retraced; where rounding does not allow the fraction, the tolerance itself counts.
+const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // What is accepted where rounding in U (strained, badly scaled constraints) keeps the iteration from going on.
 const double DENSITY_ROUNDING = 1e-8;
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
@@ -48,7 +52,8 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
                                   &wBack, &vBack, &forceBack, &w})
         vectors->resize(numParticles);
     for (vector<double>* numbers : {&lambda, &appliedTerm, &lambdaNext, &multiplierTrial, &residual, &correction,
-                                    &coupling, &response, &lambdaBack})
+                                    &coupling, &response, &lambdaBack,
+                                    &multiplierOffset})
         numbers->resize(numConstraints);
     jacobian.resize(numConstraints);
     jacobianNext.resize(numConstraints);
@@ -189,11 +194,12 @@ bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
         lastError = system.evaluate(qNext, residual);
         if (!std::isfinite(lastError))
             break;
-        if (lastError <= settings.tolerance) {
+        const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
+        if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN)) {
             positions = qNext;
             return true;
         }
-        isNewton = isNewton || lastError > SLOW_CONVERGENCE * previous;
+        isNewton = isNewton || isSlow;
         previous = lastError;
         correction = residual;
         if (isNewton) {
@@ -219,6 +225,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     force = forces;
     groupEnergy = energy;
     forgetDensity();
+    std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
     isFactorCurrent = false;
     restoreFactor();
     projectVelocities(v);
@@ -285,9 +292,22 @@ void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, doubl
     }
 }
 
+// Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes that O(h^3).
+void VRattleDynamics::addMultiplierOffset() {
+    for (size_t k = 0; k < lambdaNext.size(); k++)
+        lambdaNext[k] += multiplierOffset[k];
+}
+
+void VRattleDynamics::keepMultiplierOffset() {
+    for (size_t k = 0; k < lambdaNext.size(); k++)
+        multiplierOffset[k] = lambdaNext[k] - lambda[k];
+}
+
 // Newton's iteration on lambda for g(q+) = 0 (3.11), with A = -kick drift K(q), or G(q+) M^-1 G(q)^T in place of K.
-bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift) {
-    lambdaNext = lambda; // Lambda(q,p) agrees with lambda to O(h^2)
+bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift, double margin) {
+    lambdaNext = lambda;
+    if (margin == REGULAR_MARGIN)
+        addMultiplierOffset();
     bool isNewton = false;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
@@ -297,10 +317,11 @@ bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, dou
         lastError = system.evaluate(qNext, residual);
         if (!std::isfinite(lastError))
             return false;
+        const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
         // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance.
-        if (iteration > 0 && lastError <= settings.tolerance)
+        if (iteration > 0 && lastError <= settings.tolerance * (isSlow ? 1.0 : margin))
             return true;
-        isNewton = isNewton || lastError > SLOW_CONVERGENCE * previous;
+        isNewton = isNewton || isSlow;
         previous = lastError;
         correction = residual;
         if (isNewton) {
@@ -323,6 +344,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     const double h = settings.stepSize;
     const double uMinus = evaluateU(w);
     lambdaNext = lambda;
+    addMultiplierOffset();
     rhoNext = StepDensity::sumUpdate(u, rho);
     if (!(rhoNext > 0))
         rhoNext = density.boundedUpdate(u, rho);
@@ -336,7 +358,8 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F of METHOD section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
-        const double error = std::max(lastError / settings.tolerance, relativeMismatch / DENSITY_TOLERANCE);
+        const double error =
+            std::max(lastError / (REGULAR_MARGIN * settings.tolerance), relativeMismatch / DENSITY_TOLERANCE);
         if (!std::isfinite(error))
             return NotConverged;
         const bool isSlow = error > SLOW_CONVERGENCE * previous;
@@ -418,7 +441,7 @@ double VRattleDynamics::solveRegular() {
     if (isRescue)
         rhoNext = density.boundedUpdate(u, rho);
     const double drift = settings.stepSize / rhoNext;
-    if (!solvePositions(w, 0.5 * (settings.stepSize / rho + drift), drift))
+    if (!solvePositions(w, 0.5 * (settings.stepSize / rho + drift), drift, REGULAR_MARGIN))
         throwNotConverged();
     numRescues += isRescue;
     return drift;
@@ -468,7 +491,7 @@ double VRattleDynamics::step(double maxStep) {
         restoreFactor();
         if (isShortened)
             stepKind = Shortened;
-        if (!solvePositions(v, 0.5 * stepNext, stepNext))
+        if (!solvePositions(v, 0.5 * stepNext, stepNext, ON_STEP_MARGIN))
             throwNotConverged();
     }
     if (isShortened && hasDensity) // where the density would be at the end of the shortened step
@@ -480,6 +503,8 @@ double VRattleDynamics::step(double maxStep) {
 bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     if (!isFinite(forces))
         throw StepFailure("the force on a particle became infinite or not a number at the end of the step");
+    if (stepKind == Regular)
+        keepMultiplierOffset();
     vector<double> backValues;
     bool hasBack = false;
     const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
@@ -516,6 +541,7 @@ void VRattleDynamics::reverse() {
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
         solveRegular();
+        keepMultiplierOffset();
         numRescues = rescuesBefore;
         for (int i = 0; i < system.getNumParticles(); i++)
             w[i] = -wNext[i];
@@ -541,7 +567,7 @@ void VRattleDynamics::reverse() {
 bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energy, vector<double>& backValues) {
     qNext.swap(qBack);
     wNext.swap(wBack);
-    bool isSolved = solvePositions(v, -0.5 * stepNext, -stepNext);
+    bool isSolved = solvePositions(v, -0.5 * stepNext, -stepNext, ON_STEP_MARGIN);
     qNext.swap(qBack);
     wNext.swap(wBack);
     if (!isSolved)

@@ -153,7 +153,9 @@ private:
                         std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
                         std::vector<double>& monitorValues);
     void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
-    bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double margin);
+    void addMultiplierOffset();
+    void keepMultiplierOffset();
     SolveResult solveCoupled();
     double solveRegular();
     [[noreturn]] void throwNotConverged() const;
@@ -172,6 +174,7 @@ private:
     std::vector<OpenMM::Vec3> q, v, w, force;
     double groupEnergy, rho, u;
     std::vector<double> lambda, values, appliedTerm; // appliedTerm: G M^-1 F
+    std::vector<double> multiplierOffset;            // lambda[n-1] - Lambda[n-1]
     ConstraintSystem::Jacobian jacobian;             // G(q[n]), to which the factor of the matrix belongs
     bool hasDensity, isFactorCurrent;
     double firstDensity; // of the first step, once it is known; else 0
