@@ -187,7 +187,7 @@ def _progress_bar(console, description: str):
 def _print_comparison(console, comparison) -> None:
     from rich.table import Table
 
-    from .comparison import verdict
+    from .comparison import two_digits, verdict
 
     table = Table(
         title=f"{comparison.system_name}: {comparison.total_time:g} ps, platform {comparison.platform}, "
@@ -213,24 +213,20 @@ def _print_comparison(console, comparison) -> None:
         name = run.name if run.failure is None else f"{run.name} (failed)"
         table.add_row(
             name,
-            _number(run.largest_energy_error),
-            _number(run.rms_energy_error),
-            _number(run.final_energy_error),
-            _number(run.smallest_step),
-            _number(run.largest_step),
+            two_digits(run.largest_energy_error),
+            two_digits(run.rms_energy_error),
+            two_digits(run.final_energy_error),
+            two_digits(run.smallest_step),
+            two_digits(run.largest_step),
             f"{run.force_evaluations:,}",
-            _number(run.largest_constraint_error),
-            _number(run.seconds_per_step * 1e6, "{:.1f}"),
+            two_digits(run.largest_constraint_error),
+            f"{run.seconds_per_step * 1e6:.1f}" if run.steps else "-",
             f"{run.energy_samples:,}",
             style=style,
         )
     console.print(table)
     for sentence in verdict(comparison):
         console.print(sentence, highlight=False, soft_wrap=True, markup=False)
-
-
-def _number(value: float, pattern: str = "{:.2g}") -> str:
-    return pattern.format(value) if math.isfinite(value) else "-"
 
 
 if __name__ == "__main__":

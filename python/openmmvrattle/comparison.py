@@ -41,11 +41,14 @@ from .testsystems import ComparisonSettings, StepControl, TestSystem, constraint
 
 __all__ = [
     "Comparison",
+    "Envelope",
     "IntegratorRun",
     "Series",
     "compare",
     "envelope",
+    "make_integrator",
     "quick_settings",
+    "two_digits",
     "verdict",
     "write_json",
     "write_series",
@@ -225,13 +228,21 @@ def compare(
     )
 
 
+def two_digits(value: float) -> str:
+    """A number with two significant digits, without an exponent where it is easy to read so."""
+    if not math.isfinite(value):
+        return "-"
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:,.0f}" if 100 <= abs(rounded) < 1e6 else f"{rounded:.2g}"
+
+
 def verdict(comparison: Comparison) -> list[str]:
     """What the numbers say, in plain sentences: also where variable steps lose."""
     sentences = []
     best = comparison.best()
     if best is None:
         return ["No integrator reached the end."]
-    sentences.append(f"Smallest largest energy error: {best.name}, {best.largest_energy_error:.2g} kJ/mol.")
+    sentences.append(f"Smallest largest energy error: {best.name}, {two_digits(best.largest_energy_error)} kJ/mol.")
     for run in comparison.runs:
         if run.method == "vrattle" and run.failure is None:
             sentences.append(_judgement(comparison, run))
@@ -259,9 +270,9 @@ def _judgement(comparison: Comparison, run: IntegratorRun) -> str:
     against_openmm = comparison.gain(run, "fixed")
     numbers = []
     if math.isfinite(against_control):
-        numbers.append(f"{against_control:.2g} over RATTLE with fixed steps")
+        numbers.append(f"{two_digits(against_control)} over RATTLE with fixed steps")
     if math.isfinite(against_openmm):
-        numbers.append(f"{against_openmm:.2g} over VerletIntegrator")
+        numbers.append(f"{two_digits(against_openmm)} over VerletIntegrator")
     if not numbers:
         return f"{run.name} reached the end, where no integrator with fixed steps did."
     gain = against_control if math.isfinite(against_control) else against_openmm
@@ -412,6 +423,8 @@ def _measure(
                 sizes.append(size)
             if steps % constraint_interval == 0 or last:
                 largest_constraint_error = max(largest_constraint_error, _constraint_error(test_system, context))
+                if largest_constraint_error >= 1.0:
+                    raise _RunError(f"at {simulated:.4g} ps it had lost its constraints")
                 report("running", simulated / settings.total_time)
             if steps >= limit and not last:
                 raise _RunError(f"it had done only {simulated:.4g} ps after {steps} steps")

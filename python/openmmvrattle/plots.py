@@ -17,11 +17,18 @@ __all__ = ["draw_comparison", "save_comparison"]
 # Colours that can be told apart with any colour vision (Okabe and Ito).
 _COLOURS = {"fixed": "#E69F00", "variable": "#56B4E9", "control": "#555555"}
 _PRODUCT_COLOURS = ("#D55E00", "#009E73", "#CC79A7", "#0072B2")
+# Fixed steps and OpenMM's variable steps often coincide: a wide line, a narrow one on it and dashes can all be seen.
+_STYLES: dict[str, dict[str, Any]] = {
+    "fixed": {"linewidth": 3.2, "alpha": 0.7, "zorder": 2},
+    "variable": {"linewidth": 1.3, "zorder": 2.2},
+    "control": {"linewidth": 1.3, "linestyle": (0, (4, 2)), "zorder": 2.4},
+    "vrattle": {"linewidth": 1.8, "zorder": 3},
+}
 _ENERGY_FLOOR = 1e-12
 """kJ/mol; smaller errors cannot be told from rounding."""
 
 
-def draw_comparison(comparison: Comparison, windows: int = 500) -> Figure:
+def draw_comparison(comparison: Comparison, windows: int = 300) -> Figure:
     """Draw the energy error of all runs above their step sizes.
 
     Each line shows the largest value in each of many short windows of time, the shade below it reaches to the smallest.
@@ -40,11 +47,12 @@ def draw_comparison(comparison: Comparison, windows: int = 500) -> Figure:
         else:
             top.plot([], [], color=colour, label=f"{run.name} (failed)")
     top.set_yscale("log")
+    top.set_ylim(bottom=_lower_limit(top))
     top.set_ylabel("energy error |E - E(0)|\n(kJ/mol)")
     top.set_title(
         f"{comparison.description}: about {comparison.force_evaluations:,} force evaluations each", fontsize=11
     )
-    bottom.set_yscale("log")
+    bottom.set_yscale("log" if _step_range(comparison) > 5.0 else "linear")
     bottom.set_ylabel("step size (ps)")
     bottom.set_xlabel("time (ps)")
     bottom.set_xlim(0.0, comparison.total_time)
@@ -62,19 +70,28 @@ def save_comparison(comparison: Comparison, path: Path) -> None:
     draw_comparison(comparison).savefig(path)
 
 
+def _lower_limit(axes: Any) -> float | None:
+    """Where an axis of energy errors may begin: shades may reach below it, lines may not."""
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines] or [np.array([])])
+    return float(values.min()) / 3.0 if len(values) else None
+
+
+def _step_range(comparison: Comparison) -> float:
+    """The largest step of any run divided by the smallest."""
+    runs = [run for run in comparison.runs if run.steps]
+    return max(run.largest_step for run in runs) / min(run.smallest_step for run in runs) if runs else 1.0
+
+
 def _draw_run(top: Any, bottom: Any, comparison: Comparison, run: IntegratorRun, colour: str, windows: int) -> None:
     reduced = envelope(run.series, comparison.total_time, windows)
     largest = np.maximum(np.abs(reduced.largest_energy_errors), _ENERGY_FLOOR)
     smallest = np.maximum(np.abs(reduced.smallest_energy_errors), _ENERGY_FLOOR)
-    product = run.method == "vrattle"
-    # VerletIntegrator and RATTLE with fixed steps nearly coincide: dashes let the one below be seen.
-    dashes = "--" if run.method == "control" else "-"
-    style: dict[str, Any] = {"color": colour, "linewidth": 1.7 if product else 1.2, "linestyle": dashes}
-    order = 3 if product else 2
+    style: dict[str, Any] = {"color": colour} | _STYLES[run.method]
+    order = style["zorder"]
     label = run.name if run.failure is None else f"{run.name} (failed at {run.simulated_time:.3g} ps)"
-    top.plot(reduced.times, largest, label=label, zorder=order, **style)
-    top.fill_between(reduced.times, smallest, largest, color=colour, alpha=0.12, linewidth=0, zorder=order - 1)
-    bottom.plot(reduced.times, reduced.smallest_steps, zorder=order, **style)
+    top.plot(reduced.times, largest, label=label, **style)
+    top.fill_between(reduced.times, smallest, largest, color=colour, alpha=0.1, linewidth=0, zorder=order - 1.5)
+    bottom.plot(reduced.times, reduced.smallest_steps, **style)
     bottom.fill_between(
         reduced.times,
         reduced.smallest_steps,
@@ -82,5 +99,5 @@ def _draw_run(top: Any, bottom: Any, comparison: Comparison, run: IntegratorRun,
         color=colour,
         alpha=0.2,
         linewidth=0,
-        zorder=order - 1,
+        zorder=order - 1.5,
     )

@@ -25,6 +25,7 @@ from openmmvrattle.comparison import (
     compare,
     envelope,
     quick_settings,
+    two_digits,
     verdict,
     write_json,
     write_series,
@@ -168,6 +169,15 @@ def test_energy_that_is_not_a_number_is_a_failure():
     assert verdict(result)
 
 
+def test_lost_constraints_are_a_failure():
+    """Where OpenMM's solver gives up, its integrator goes on with bonds of any length."""
+    test_system = SYSTEMS["light-heavy-chain"]()
+    settings = replace(test_system.settings, force_evaluations=330, controls=())
+    verlet = compare(test_system, settings=settings).runs[0]
+    assert verlet.method == "fixed"
+    assert verlet.failure.endswith("it had lost its constraints")
+
+
 def test_interrupt_keeps_what_was_done():
     test_system = SYSTEMS["rigid-waters"]()
 
@@ -238,6 +248,23 @@ def test_gain():
     result = make_comparison(make_run("fixed", 8.0), make_run("control", 4.0), make_run("vrattle", 2.0))
     assert result.gain(result.runs[2]) == 2.0
     assert result.gain(result.runs[2], "fixed") == 4.0
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (24_567.0, "25,000"),
+        (0.0, "0"),
+        (1.04, "1"),
+        (99.9, "100"),
+        (-734.0, "-730"),
+        (1.23e-9, "1.2e-09"),
+        (math.nan, "-"),
+    ],
+)
+def test_two_digits(value, text):
+    assert two_digits(value) == text
+    assert two_digits(math.nan) == "-"
 
 
 def test_envelope_keeps_peaks():

@@ -3,6 +3,7 @@
 """The systems start where their descriptions say, and on their constraints."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -180,6 +181,7 @@ def test_without_constraints_nothing_is_moved():
 
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "quick_start.py"
+README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.mark.skipif(not EXAMPLE.exists(), reason="needs the folder examples")
@@ -189,3 +191,14 @@ def test_quick_start_keeps_the_energy():
     energies = [float(line.split("energy")[1].split()[0]) for line in result.stdout.splitlines()]
     assert len(energies) == 20
     np.testing.assert_allclose(energies, -288.493, atol=0.01)
+
+
+@pytest.mark.skipif(not README.exists(), reason="needs the file README.md")
+def test_readme_shows_what_runs():
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 2
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert names["context"].getTime()._value == pytest.approx(3.0)
+    assert names["molecular"].getNumMonitors() == 1
