@@ -1,0 +1,53 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_TESTSUPPORT_H_
+#define OPENMMVRATTLE_TESTSUPPORT_H_
+
+#include "openmm/OpenMMException.h"
+#include "openmm/internal/AssertionUtilities.h"
+#include <functional>
+#include <iostream>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+using OpenMM::throwException; // which OpenMM's ASSERT macros name without its namespace
+
+typedef std::vector<std::pair<std::string, std::function<void()>>> TestList;
+
+/** Run tests, report each that fails, and return the exit status of the program. */
+inline int runTests(const TestList& tests) {
+    int numFailed = 0;
+    for (const auto& test : tests) {
+        try {
+            test.second();
+            std::cout << "passed: " << test.first << std::endl;
+        }
+        catch (const std::exception& e) {
+            numFailed++;
+            std::cout << "FAILED: " << test.first << ": " << e.what() << std::endl;
+        }
+    }
+    std::cout << tests.size() - numFailed << " passed, " << numFailed << " failed" << std::endl;
+    return numFailed == 0 ? 0 : 1;
+}
+
+/** Assert that an action throws an exception whose text contains something. */
+template <class Action> void assertThrows(const std::string& text, Action action) {
+    try {
+        action();
+    }
+    catch (const std::exception& e) {
+        if (std::string(e.what()).find(text) == std::string::npos)
+            throw OpenMM::OpenMMException("expected an exception with \"" + text + "\", got \"" + e.what() + "\"");
+        return;
+    }
+    throw OpenMM::OpenMMException("expected an exception with \"" + text + "\", got none");
+}
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_TESTSUPPORT_H_
