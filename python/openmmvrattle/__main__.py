@@ -8,15 +8,23 @@ import argparse
 import importlib.metadata
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import openmm
 
 from .testsystems import SYSTEMS, ComparisonSettings
 
+if TYPE_CHECKING:
+    from .comparison import Comparison, IntegratorRun, Progress
+
 _DEFAULT_SYSTEMS = ("double-pendulum", "alanine-dipeptide-hbonds", "alanine-dipeptide-allbonds")
+
+_WIDTH_OF_TABLE = 160
+"""Characters that the table of runs needs with one line for each integrator."""
 
 _EXAMPLES = """examples:
   python -m openmmvrattle compare
@@ -104,7 +112,7 @@ def _compare(options: argparse.Namespace) -> int:
     from .comparison import compare, write_json, write_series, write_summary
 
     # On a terminal rich finds the width itself; in a file or a pipe the table must not be cut.
-    console = Console() if sys.stdout.isatty() else Console(width=160)
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH_OF_TABLE)
     comparisons = []
     for name in options.system:
         test_system = SYSTEMS[name]()
@@ -156,21 +164,20 @@ def _settings(settings: ComparisonSettings, options: argparse.Namespace) -> Comp
     return quick_settings(settings) if options.quick else settings
 
 
-def _progress_bar(console, description: str):
+def _progress_bar(console: Any, description: str) -> AbstractContextManager[Progress]:
     """A context that shows a progress bar and gives the function that moves it."""
-    from contextlib import contextmanager
-
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as ProgressBar
 
     @contextmanager
-    def bar():
+    def bar() -> Iterator[Progress]:
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}% {task.fields[activity]}"),
             TimeElapsedColumn(),
         )
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        with ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
             tasks = {}
 
             def move(name: str, activity: str, fraction: float) -> None:
@@ -184,49 +191,62 @@ def _progress_bar(console, description: str):
     return bar()
 
 
-def _print_comparison(console, comparison) -> None:
+def _print_comparison(console: Any, comparison: Comparison) -> None:
+    """Print the table of a comparison and what it says in words."""
     from rich.table import Table
 
-    from .comparison import two_digits, verdict
+    from .comparison import verdict
 
     table = Table(
         title=f"{comparison.system_name}: {comparison.total_time:g} ps, platform {comparison.platform}, "
         f"E(0) = {comparison.initial_energy:.6g} kJ/mol",
         title_justify="left",
     )
-    table.add_column("integrator")
-    for heading in (
-        "largest\nenergy error\n(kJ/mol)",
-        "rms\nenergy error\n(kJ/mol)",
-        "energy error\nat the end\n(kJ/mol)",
-        "smallest\nstep\n(ps)",
-        "largest\nstep\n(ps)",
-        "force\nevaluations",
-        "largest\nconstraint\nerror",
-        "wall time\nper step\n(µs)",
-        "energy\nsamples",
-    ):
-        table.add_column(heading, justify="right")
-    best = comparison.best()
-    for run in comparison.runs:
-        style = "bold green" if run is best else ("red" if run.failure is not None else None)
-        name = run.name if run.failure is None else f"{run.name} (failed)"
-        table.add_row(
-            name,
-            two_digits(run.largest_energy_error),
-            two_digits(run.rms_energy_error),
-            two_digits(run.final_energy_error),
-            two_digits(run.smallest_step),
-            two_digits(run.largest_step),
-            f"{run.force_evaluations:,}",
-            two_digits(run.largest_constraint_error),
-            f"{run.seconds_per_step * 1e6:.1f}" if run.steps else "-",
-            f"{run.energy_samples:,}",
-            style=style,
-        )
+    names = [run.name if run.failure is None else f"{run.name} (failed)" for run in comparison.runs]
+    measures = [_measures_of(run) for run in comparison.runs]
+    styles = [_style_of(run, comparison) for run in comparison.runs]
+    if console.width >= _WIDTH_OF_TABLE:
+        table.add_column("integrator", no_wrap=True)
+        for heading in measures[0]:
+            table.add_column(heading, justify="right")
+        for name, values, style in zip(names, measures, styles, strict=True):
+            table.add_row(name, *values.values(), style=style)
+    else:
+        # A narrow window: a column for each integrator, under its number.
+        table.add_column("")
+        for number, style in enumerate(styles, 1):
+            table.add_column(str(number), justify="right", style=style)
+        for heading in measures[0]:
+            table.add_row(heading.replace("\n", " "), *(values[heading] for values in measures))
     console.print(table)
+    if console.width < _WIDTH_OF_TABLE:
+        for number, (name, style) in enumerate(zip(names, styles, strict=True), 1):
+            console.print(f"{number}: {name}", style=style, highlight=False, markup=False)
     for sentence in verdict(comparison):
         console.print(sentence, highlight=False, soft_wrap=True, markup=False)
+
+
+def _measures_of(run: IntegratorRun) -> dict[str, str]:
+    """What the table shows of a run, by heading."""
+    from .comparison import two_digits
+
+    return {
+        "largest\nenergy error\n(kJ/mol)": two_digits(run.largest_energy_error),
+        "rms\nenergy error\n(kJ/mol)": two_digits(run.rms_energy_error),
+        "energy error\nat the end\n(kJ/mol)": two_digits(run.final_energy_error),
+        "smallest\nstep\n(ps)": two_digits(run.smallest_step),
+        "largest\nstep\n(ps)": two_digits(run.largest_step),
+        "force\nevaluations": f"{run.force_evaluations:,}",
+        "largest\nconstraint\nerror": two_digits(run.largest_constraint_error),
+        "wall time\nper step\n(µs)": f"{run.seconds_per_step * 1e6:.1f}" if run.steps else "-",
+        "energy\nsamples": f"{run.energy_samples:,}",
+    }
+
+
+def _style_of(run: IntegratorRun, comparison: Comparison) -> str | None:
+    if run.failure is not None:
+        return "red"
+    return "bold green" if run is comparison.best() else None
 
 
 if __name__ == "__main__":

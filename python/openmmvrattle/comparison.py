@@ -259,7 +259,9 @@ def verdict(comparison: Comparison) -> list[str]:
             f"{comparison.constraint_tolerance:.0e}): part of its energy error comes from OpenMM's constraint "
             "solver and not from its steps, so judge step control by RATTLE with fixed steps."
         )
-    sentences.extend(f"{run.name} failed: {run.failure}" for run in comparison.runs if run.failure is not None)
+    sentences.extend(
+        f"{run.name} failed: {run.failure.rstrip('.')}." for run in comparison.runs if run.failure is not None
+    )
     if comparison.interrupted:
         sentences.append("The comparison was interrupted and is not complete.")
     return sentences
@@ -524,8 +526,8 @@ def _checked_step(integrator: Any, simulated: float) -> float:
     size = integrator.getStepSize()
     size = size._value if unit.is_quantity(size) else size
     if not 0.0 < size < math.inf:
-        reason = " for want of an applied force to take it from" if size == math.inf else ""
-        raise _RunError(f"at {simulated:.4g} ps its step size became {size}{reason}")
+        what = "infinite, for want of an applied force to take it from" if size == math.inf else f"{size}"
+        raise _RunError(f"at {simulated:.4g} ps its step size became {what}")
     return size
 
 

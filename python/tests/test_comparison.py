@@ -3,6 +3,7 @@
 """The comparison of integrators: its numbers, its files and its command line."""
 
 import csv
+import io
 import json
 import math
 import os
@@ -32,6 +33,7 @@ from openmmvrattle.comparison import (
     write_summary,
 )
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, StepControl
+from rich.console import Console
 
 METHODS = ["fixed", "variable", "control", "vrattle"]
 
@@ -319,6 +321,18 @@ def test_files(chain, tmp_path):
     assert content["runs"][1]["largest_energy_error"] is None
     assert content["verdict"] == verdict(chain)
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_table_is_whole(chain, width):
+    """No number may be cut, however narrow the window."""
+    console = Console(width=width, file=io.StringIO())
+    command_line._print_comparison(console, chain)
+    text = console.file.getvalue()
+    assert "…" not in text
+    for run in chain.runs:
+        assert run.name in text
+        assert two_digits(run.largest_energy_error) in text
 
 
 def run_command(*arguments, **options):
