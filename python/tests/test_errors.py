@@ -1,0 +1,431 @@
+# OpenMM-VRATTLE: what is wrong is said, and does no harm.
+# SPDX-License-Identifier: MIT
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import openmm
+import pytest
+from dense_reference import (
+    UPDATES,
+    chain,
+    double_pendulum,
+    open_context,
+    positions_of,
+    ring,
+    time_of,
+    value,
+    velocities_of,
+    waters,
+)
+from openmm import unit
+from openmmvrattle import VariableStepRattleIntegrator
+
+BAD_SIZES = [0.0, -0.001, float("nan"), float("inf"), -float("inf")]
+
+
+@pytest.mark.parametrize("size", BAD_SIZES)
+def test_step_sizes_must_be_positive_and_finite(size: float) -> None:
+    with pytest.raises(openmm.OpenMMException, match="step size"):
+        VariableStepRattleIntegrator(size)
+    integrator = VariableStepRattleIntegrator(0.001)
+    for method in (integrator.setStepSize, integrator.setNominalStepSize):
+        with pytest.raises(openmm.OpenMMException, match="step size"):
+            method(size)
+    if size != 0:  # which means no bound
+        for method in (integrator.setMinimumStepSize, integrator.setMaximumStepSize):
+            with pytest.raises(openmm.OpenMMException, match="step size"):
+                method(size)
+    assert value(integrator.getNominalStepSize()) == 0.001
+    assert value(integrator.getMaximumStepSize()) == 0.002
+    assert value(integrator.getMinimumStepSize()) == 0.00002
+
+
+@pytest.mark.parametrize("tolerance", BAD_SIZES)
+def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
+    integrator = VariableStepRattleIntegrator(0.001)
+    with pytest.raises(openmm.OpenMMException, match="tolerance"):
+        integrator.setConstraintTolerance(tolerance)
+    assert integrator.getConstraintTolerance() == 1e-8
+
+
+def test_bounds_must_enclose_the_nominal_size() -> None:
+    integrator = VariableStepRattleIntegrator(0.001)
+    for size in (0.001, 0.0011, 1.0):
+        with pytest.raises(openmm.OpenMMException, match="minimum"):
+            integrator.setMinimumStepSize(size)
+    for size in (0.001, 0.0009, 1e-9):
+        with pytest.raises(openmm.OpenMMException, match="maximum"):
+            integrator.setMaximumStepSize(size)
+    integrator.setMinimumStepSize(0.0005)
+    integrator.setMaximumStepSize(0.004)
+    for size in (0.0005, 0.0004, 0.004, 0.005):
+        with pytest.raises(openmm.OpenMMException, match="minimum|maximum|between"):
+            integrator.setStepSize(size)
+    assert value(integrator.getStepSize()) == 0.001
+    integrator.setStepSize(0.0015)
+    integrator.setMinimumStepSize(0)
+    integrator.setMaximumStepSize(0)
+    integrator.setStepSize(1.0)
+    assert value(integrator.getMinimumStepSize()) == value(integrator.getMaximumStepSize()) == 0
+
+
+def test_monitor_settings() -> None:
+    kinds = VariableStepRattleIntegrator
+    integrator = VariableStepRattleIntegrator(0.001)
+    assert integrator.getNumMonitors() == 1
+    assert tuple(integrator.getMonitor(0)) == (kinds.ConstraintMultipliers, 1.0, 1.0)
+    for bad in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(openmm.OpenMMException, match="weight"):
+            integrator.addMonitor(kinds.MaxForce, bad, 1.0)
+        with pytest.raises(openmm.OpenMMException, match="power"):
+            integrator.addMonitor(kinds.MaxForce, 1.0, bad)
+    for kind in (-1, 11, 1000):
+        with pytest.raises(openmm.OpenMMException, match="monitor"):
+            integrator.addMonitor(kind)
+    assert integrator.getNumMonitors() == 1
+    for index in (-1, 1, 100):
+        for call in (integrator.getMonitor, integrator.getReferenceMonitorValue, integrator.getMonitorValue):
+            with pytest.raises(openmm.OpenMMException):
+                call(index)
+        with pytest.raises(openmm.OpenMMException, match="index|monitor"):
+            integrator.setReferenceMonitorValue(1.0, index)
+    for bad in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(openmm.OpenMMException, match="reference"):
+            integrator.setReferenceMonitorValue(bad)
+    for order in (0.0, 0.99, -8.0, float("nan"), float("inf")):
+        with pytest.raises(openmm.OpenMMException, match="order"):
+            integrator.setNormOrder(order)
+    for group in (-1, 32):
+        with pytest.raises(openmm.OpenMMException, match="group"):
+            integrator.setMonitorForceGroup(group)
+    for method in (-1, 3):
+        with pytest.raises(openmm.OpenMMException, match="update"):
+            integrator.setUpdateMethod(method)
+    assert integrator.getNormOrder() == 8
+    assert integrator.getMonitorForceGroup() == 31
+    assert integrator.getUpdateMethod() == kinds.SemiExplicit
+    assert integrator.getReferenceMonitorValue() == 0
+    assert integrator.addMonitor(kinds.MaxForce, 0.5, 2.0) == 1
+    assert tuple(integrator.getMonitor(1)) == (kinds.MaxForce, 0.5, 2.0)
+
+
+def test_wrong_types_and_units() -> None:
+    integrator = VariableStepRattleIntegrator(1 * unit.femtosecond)
+    assert value(integrator.getStepSize()) == pytest.approx(0.001, rel=1e-15)
+    with pytest.raises(TypeError):
+        integrator.setStepSize(1 * unit.nanometer)
+    with pytest.raises(TypeError):
+        integrator.setStepSize("0.001")
+    with pytest.raises(TypeError):
+        VariableStepRattleIntegrator(None)
+
+
+def test_without_a_context() -> None:
+    integrator = VariableStepRattleIntegrator(0.001)
+    calls: list[Callable[[], Any]] = [
+        lambda: integrator.step(1),
+        lambda: integrator.stepTo(1.0),
+        integrator.reverse,
+        integrator.getMultipliers,
+        integrator.getMonitorValue,
+        lambda: integrator.calibrate(5),
+    ]
+    for call in calls:
+        with pytest.raises(openmm.OpenMMException, match="(?i)context"):
+            call()
+    assert integrator.getStepDensity() == 1
+    assert integrator.getNumRescues() == 0
+
+
+def test_before_positions_are_set(platform: str) -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(0.001)
+    context = open_context(model.system(), integrator, platform)
+    with pytest.raises(openmm.OpenMMException, match="(?i)position"):
+        integrator.step(1)
+    context.setPositions(model.positions)
+    context.setVelocities(model.velocities)
+    integrator.step(1)
+    assert time_of(context) > 0
+
+
+@pytest.mark.parametrize("target", [float("nan"), float("inf")])
+def test_step_to_no_time(target: float) -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(0.001)
+    context = open_context(model.system(), integrator, "Reference", model)
+    with pytest.raises(openmm.OpenMMException, match="time"):
+        integrator.stepTo(target)
+    assert time_of(context) == 0
+
+
+def test_collinear_distances_name_the_particles(platform: str) -> None:
+    """All three distances of a linear molecule: three constraints of which only two are independent in first order."""
+    system = openmm.System()
+    for mass in (1.0, 20.0, 12.0, 16.0, 16.0):
+        system.addParticle(mass)
+    system.addConstraint(0, 1, 0.1)
+    system.addConstraint(3, 2, 0.116)
+    system.addConstraint(2, 4, 0.116)
+    system.addConstraint(3, 4, 0.232)
+    integrator = VariableStepRattleIntegrator(0.001)
+    with pytest.raises(openmm.OpenMMException) as caught:
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+        context.setPositions([[0, 0, 0], [0.1, 0, 0], [1, 0, 0], [0.884, 0, 0], [1.116, 0, 0]])
+        context.setVelocities(np.full((5, 3), 0.1))
+        integrator.step(1)
+    assert named_particles(str(caught.value)) == {2, 3, 4}, str(caught.value)
+    assert "nan" not in str(caught.value).lower()
+
+
+def test_redundant_framework(platform: str) -> None:
+    """All ten distances of five particles in space: one more than they have degrees of freedom in their shape."""
+    model = chain()
+    system = openmm.System()
+    for mass in model.masses:
+        system.addParticle(float(mass))
+    system.addConstraint(0, 1, float(model.lengths[0]))
+    for i in range(3, 8):
+        for j in range(i + 1, 8):
+            system.addConstraint(i, j, float(np.linalg.norm(model.positions[i] - model.positions[j])))
+    integrator = VariableStepRattleIntegrator(0.001)
+    with pytest.raises(openmm.OpenMMException) as caught:
+        context = open_context(system, integrator, platform, model)
+        integrator.step(1)
+        del context
+    assert named_particles(str(caught.value)) == {3, 4, 5, 6, 7}, str(caught.value)
+
+
+def named_particles(message: str) -> set[int]:
+    """The numbers after the word particles in an error message."""
+    found = re.search(r"particles((?:[ ,]|and|\d)+)", message)
+    return {int(number) for number in re.findall(r"\d+", found.group(1))} if found else set()
+
+
+def test_unknown_platform() -> None:
+    """A platform without our kernel, where there is one."""
+    names = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
+    others = names - {"Reference", "CPU"}
+    if not others:
+        pytest.skip("this OpenMM has only platforms that are served")
+    for name in others:
+        model = chain()
+        with pytest.raises(openmm.OpenMMException):
+            open_context(model.system(), VariableStepRattleIntegrator(0.001), name, model)
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_positions_that_are_no_numbers(update: str, platform: str) -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(0.001)
+    integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, update))
+    context = open_context(model.system(), integrator, platform, model)
+    broken = model.positions.copy()
+    broken[3, 1] = np.nan
+    context.setPositions(broken)
+    with pytest.raises(openmm.OpenMMException, match="(?i)nan|finite|not a number"):
+        integrator.step(1)
+    assert time_of(context) == 0
+    context.setPositions(model.positions)
+    integrator.step(5)
+    assert np.all(np.isfinite(positions_of(context)))
+
+
+@pytest.mark.parametrize("update", [*UPDATES, None])
+@pytest.mark.parametrize("make", [chain, ring, waters])
+def test_failed_step_leaves_the_state(make: Callable[[], Any], update: str | None, platform: str) -> None:
+    """A step that is far too long fails; the Context is as before, and a shorter step goes on."""
+    model = make()
+    integrator = VariableStepRattleIntegrator(0.001)
+    integrator.setMinimumStepSize(0)
+    integrator.setMaximumStepSize(0)
+    if update is None:
+        integrator.clearMonitors()
+    else:
+        integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, update))
+    context = open_context(model.system(), integrator, platform, model)
+    integrator.step(20)
+    before = positions_of(context), velocities_of(context), time_of(context)
+    density, reference = integrator.getStepDensity(), integrator.getReferenceMonitorValue() if update else 0
+    integrator.setStepSize(50.0)
+    with pytest.raises(openmm.OpenMMException) as caught:
+        integrator.step(1)
+    message = str(caught.value)
+    assert "step" in message and "nan" not in message.lower()
+    assert np.array_equal(positions_of(context), before[0])
+    assert np.array_equal(velocities_of(context), before[1])
+    assert time_of(context) == before[2]
+    assert integrator.getStepDensity() == density
+    if update:
+        assert integrator.getReferenceMonitorValue() == reference
+    integrator.setStepSize(0.0005)
+    integrator.step(50)
+    c = model.constraints()
+    assert np.max(np.abs(c.relative_errors(positions_of(context).ravel()))) <= 1e-8 + 1e-14
+    assert time_of(context) > before[2] + 0.001
+    # It is the motion that would have been without the failure.
+    other = VariableStepRattleIntegrator(0.001)
+    other.setMinimumStepSize(0)
+    other.setMaximumStepSize(0)
+    if update is None:
+        other.clearMonitors()
+    else:
+        other.setUpdateMethod(getattr(VariableStepRattleIntegrator, update))
+    undisturbed = open_context(model.system(), other, platform, model)
+    other.step(20)
+    other.setStepSize(0.0005)
+    other.step(50)
+    np.testing.assert_allclose(positions_of(context), positions_of(undisturbed), rtol=0, atol=1e-7)
+
+
+def test_failed_first_step(platform: str) -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(50.0)
+    context = open_context(model.system(), integrator, platform, model)
+    with pytest.raises(openmm.OpenMMException):
+        integrator.step(1)
+    assert time_of(context) == 0
+    assert np.array_equal(positions_of(context), model.positions)
+    assert np.array_equal(velocities_of(context), model.velocities)
+    assert integrator.getReferenceMonitorValue() == 0
+    integrator.setStepSize(0.0005)
+    integrator.step(10)
+    assert 0.001 < time_of(context) < 0.02
+
+
+@pytest.mark.parametrize("failure", ["raises", "nan"])
+@pytest.mark.parametrize("update", UPDATES)
+def test_failing_force(update: str, failure: str, platform: str) -> None:
+    """The force is computed at the new positions, when the step is half done: that must be undone."""
+    model = chain()
+    broken = False
+
+    def force(state: openmm.State) -> tuple[float, np.ndarray]:
+        if broken and failure == "raises":
+            raise RuntimeError("out of order")
+        q = state.getPositions(asNumpy=True)._value
+        return float(np.sum(50 * q**2)), np.where(broken, np.nan, -100 * q)
+
+    system = model.system()
+    system.addForce(openmm.PythonForce(force))
+    runs = []
+    for fail in (False, True):
+        broken = False
+        integrator = VariableStepRattleIntegrator(0.0005)
+        integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, update))
+        context = open_context(system, integrator, platform, model)
+        integrator.step(20)
+        if fail:
+            broken = True
+            before = positions_of(context), velocities_of(context), time_of(context), integrator.getStepDensity()
+            for _ in range(2):
+                with pytest.raises(Exception, match="out of order" if failure == "raises" else "(?i)force|nan|finite"):
+                    integrator.step(3)
+            assert np.array_equal(positions_of(context), before[0])
+            assert np.array_equal(velocities_of(context), before[1])
+            assert time_of(context) == before[2]
+            assert integrator.getStepDensity() == before[3]
+            broken = False
+        integrator.step(20)
+        runs.append((positions_of(context), velocities_of(context), time_of(context)))
+        del context
+    # To the last bit on Reference; the CPU platform computes the same here.
+    for undisturbed, disturbed in zip(*runs, strict=True):
+        assert np.array_equal(undisturbed, disturbed)
+
+
+def test_failed_step_says_when_and_what_to_change(platform: str) -> None:
+    model = double_pendulum()
+    integrator = VariableStepRattleIntegrator(0.01)
+    context = open_context(model.system(), integrator, platform, model)
+    integrator.step(3)
+    integrator.setStepSize(1000.0)
+    with pytest.raises(openmm.OpenMMException, match=r"(?i)time|at t") as caught:
+        integrator.step(1)
+    # The time to at least three figures, and what can be changed.
+    assert f"{time_of(context):.3g}"[:4] in str(caught.value), str(caught.value)
+    assert "smaller" in str(caught.value) or "reduce" in str(caught.value).lower(), str(caught.value)
+
+
+def test_no_constraints_for_a_constraint_monitor(platform: str) -> None:
+    """The default monitor has nothing to look at in a system without constraints: say so, and name others."""
+    system = openmm.System()
+    system.addParticle(1.0)
+    system.addParticle(1.0)
+    bond = openmm.HarmonicBondForce()
+    bond.addBond(0, 1, 0.1, 1000.0)
+    system.addForce(bond)
+    for kind in ("ConstraintMultipliers", "ConstraintForce", "MultiplierPNorm"):
+        integrator = VariableStepRattleIntegrator(0.001)
+        integrator.clearMonitors()
+        integrator.addMonitor(getattr(VariableStepRattleIntegrator, kind))
+        with pytest.raises(openmm.OpenMMException, match="AppliedForce|ForcePNorm|VectorField|MaxForce") as caught:
+            context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+            context.setPositions([[0, 0, 0], [0.12, 0, 0]])
+            integrator.step(1)
+        assert "constraint" in str(caught.value).lower()
+    for kind in ("AppliedForce", "VectorField", "ForcePNorm", "MaxForce", "ArcLength"):
+        integrator = VariableStepRattleIntegrator(0.001)
+        integrator.clearMonitors()
+        integrator.addMonitor(getattr(VariableStepRattleIntegrator, kind))
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+        context.setPositions([[0, 0, 0], [0.12, 0, 0]])
+        context.setVelocities([[0, 0.1, 0], [0, -0.1, 0]])
+        integrator.step(20)
+        assert len(integrator.getMultipliers()) == 0
+        del context
+
+
+def test_start_where_the_monitor_vanishes(platform: str) -> None:
+    """No force and no motion: U = 0 cannot serve as a reference, and nothing is divided by it."""
+    model = ring()
+    model.add_forces = lambda system: None
+    model.velocities = np.zeros((6, 3))
+    integrator = VariableStepRattleIntegrator(0.001)
+    context = open_context(model.system(), integrator, platform, model)
+    with pytest.raises(openmm.OpenMMException, match="(?i)reference"):
+        integrator.step(1)
+    assert np.array_equal(positions_of(context), model.positions)
+    integrator.setReferenceMonitorValue(1.0)
+    integrator.step(5)
+    np.testing.assert_allclose(positions_of(context), model.positions, rtol=0, atol=1e-12)
+
+
+def test_energy_monitor_must_be_positive(platform: str) -> None:
+    model = chain()
+    system = model.system()
+    force = openmm.CustomBondForce("-1")
+    force.addBond(0, 7, [])
+    force.setForceGroup(31)
+    system.addForce(force)
+    integrator = VariableStepRattleIntegrator(0.001)
+    integrator.clearMonitors()
+    integrator.addMonitor(VariableStepRattleIntegrator.ForceGroupEnergy)
+    context = open_context(system, integrator, platform, model)
+    with pytest.raises(openmm.OpenMMException, match="(?i)positive|negative"):
+        integrator.step(1)
+    assert time_of(context) == 0
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_energy_monitor_that_becomes_negative(power: float) -> None:
+    """It starts positive and is negative some steps later: no measure of anything, and that is to be said."""
+    model = chain()
+    system = model.system()
+    start = np.linalg.norm(model.positions[7] - model.positions[0])
+    force = openmm.CustomBondForce(f"r-{start - 0.003}")
+    force.addBond(0, 7, [])
+    force.setForceGroup(31)
+    system.addForce(force)
+    integrator = VariableStepRattleIntegrator(0.0005)
+    integrator.clearMonitors()
+    integrator.addMonitor(VariableStepRattleIntegrator.ForceGroupEnergy, 1.0, power)
+    context = open_context(system, integrator, "Reference", model)
+    with pytest.raises(openmm.OpenMMException, match="(?i)monitor.*(positive|negative)"):
+        integrator.step(20)
+    assert np.all(np.isfinite(positions_of(context)))
