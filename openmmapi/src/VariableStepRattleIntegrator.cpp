@@ -184,8 +184,9 @@ double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
 void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
     checkMonitorIndex(index);
     if (!(value >= 0) || !std::isfinite(value))
-        throw OpenMMException("VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
-                              "number, or 0 to take it at the first step");
+        throw OpenMMException(
+            "VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
+            "number, or 0 to take it at the first step");
     monitors[index].reference = value;
     settingsChanged();
 }

@@ -24,9 +24,13 @@ template <class Size> double pNorm(int count, double order, Size size) {
     return largest * std::pow(sum, 1 / order);
 }
 
-bool usesMultipliers(StepMonitor::Kind kind) {
+bool usesConstraintsOnly(StepMonitor::Kind kind) {
     return kind == StepMonitor::ConstraintMultipliers || kind == StepMonitor::ConstraintForce ||
-           kind == StepMonitor::ConstraintAndAppliedForce || kind == StepMonitor::MultiplierPNorm;
+           kind == StepMonitor::MultiplierPNorm;
+}
+
+bool usesMultipliers(StepMonitor::Kind kind) {
+    return usesConstraintsOnly(kind) || kind == StepMonitor::ConstraintAndAppliedForce;
 }
 
 bool usesVelocities(StepMonitor::Kind kind) {
@@ -52,10 +56,22 @@ bool StepMonitor::needsMultipliers() const {
     return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesMultipliers(term.kind); });
 }
 
+bool StepMonitor::needsConstraints() const {
+    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesConstraintsOnly(term.kind); });
+}
+
+void StepMonitor::requireValid(const vector<double>& values) const {
+    for (size_t k = 0; k < terms.size(); k++)
+        if (!(values[k] >= 0) || !std::isfinite(values[k]))
+            throw StepFailure("monitor " + std::to_string(k) + " became " + std::to_string(values[k]) +
+                              (terms[k].kind == ForceGroupEnergy
+                                   ? ", while the energy of the monitor's force group must stay positive"
+                                   : ", while a monitor must stay positive and finite"));
+}
+
 bool StepMonitor::dependsOnVelocities() const {
-    return std::any_of(terms.begin(), terms.end(), [](const Term& term) {
-        return usesMultipliers(term.kind) || usesVelocities(term.kind);
-    });
+    return std::any_of(terms.begin(), terms.end(),
+                       [](const Term& term) { return usesMultipliers(term.kind) || usesVelocities(term.kind); });
 }
 
 void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
@@ -151,7 +167,7 @@ bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v) c
     if (!(value > 0))
         return true;
     Kind kind = terms[index].kind;
-    if (kind != ConstraintMultipliers && kind != MultiplierPNorm && kind != ConstraintForce)
+    if (!usesConstraintsOnly(kind))
         return false;
     // Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
     double largest = 0;
@@ -161,8 +177,8 @@ bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v) c
             double speedSquared = v[i].dot(v[i]), inverseMass = system.getInverseMasses()[i];
             if (inverseMass > 0) {
                 double force = std::sqrt((*forces)[i].dot((*forces)[i])) + speedSquared / (inverseMass * c.length);
-                largest = std::max(largest, kind == ConstraintForce ? force * std::sqrt(inverseMass)
-                                                                    : force / (2 * c.length));
+                largest = std::max(largest,
+                                   kind == ConstraintForce ? force * std::sqrt(inverseMass) : force / (2 * c.length));
             }
         }
     }

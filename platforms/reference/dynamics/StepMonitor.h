@@ -51,8 +51,12 @@ public:
     bool isEmpty() const {
         return terms.empty();
     }
-    /** Whether any term needs the multipliers, that is, constraints. */
+    /** Whether any term needs the multipliers. */
     bool needsMultipliers() const;
+    /** Whether any term is defined by the constraints alone, and so is zero without them. */
+    bool needsConstraints() const;
+    /** Throws a StepFailure if a value is not a finite number, or negative. */
+    void requireValid(const std::vector<double>& values) const;
     /** Whether any term changes with the velocities at fixed positions. */
     bool dependsOnVelocities() const;
 

@@ -52,16 +52,15 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
                                   &wBack, &vBack, &forceBack, &w})
         vectors->resize(numParticles);
     for (vector<double>* numbers : {&lambda, &appliedTerm, &lambdaNext, &multiplierTrial, &residual, &correction,
-                                    &coupling, &response, &lambdaBack,
-                                    &multiplierOffset})
+                                    &coupling, &response, &lambdaBack, &multiplierOffset})
         numbers->resize(numConstraints);
     jacobian.resize(numConstraints);
     jacobianNext.resize(numConstraints);
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
-    bool sameTerms = newSettings.terms.size() == settings.terms.size() &&
-                     newSettings.normOrder == settings.normOrder && newSettings.isFixedStep == settings.isFixedStep;
+    bool sameTerms = newSettings.terms.size() == settings.terms.size() && newSettings.normOrder == settings.normOrder &&
+                     newSettings.isFixedStep == settings.isFixedStep;
     bool retakeReference = false;
     vector<StepMonitor::Term> terms = newSettings.terms;
     for (size_t i = 0; i < terms.size() && sameTerms; i++) {
@@ -118,7 +117,7 @@ double VRattleDynamics::combineAndLimit(const vector<double>& monitorValues) con
 }
 
 void VRattleDynamics::requireConstraintsForMonitors() const {
-    if (system.getNumConstraints() == 0 && monitor.needsMultipliers())
+    if (system.getNumConstraints() == 0 && monitor.needsConstraints())
         throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
                           "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
                           "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
@@ -180,6 +179,7 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
     computeMultipliers(velocities, multipliers);
     monitor.setForces(forces, energy);
     monitor.evaluate(velocities, multipliers, jacobianNext, monitorValues);
+    monitor.requireValid(monitorValues);
 }
 
 bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
@@ -231,6 +231,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     projectVelocities(v);
     computeMultipliers(v, lambda);
     monitor.evaluate(v, lambda, jacobian, values);
+    monitor.requireValid(values);
 }
 
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
@@ -474,8 +475,8 @@ double VRattleDynamics::step(double maxStep) {
         stepKind = First;
         rhoNext = 1;
         const vector<StepMonitor::Term>& terms = monitor.getTerms();
-        bool hasReferences = std::all_of(terms.begin(), terms.end(),
-                                         [](const StepMonitor::Term& term) { return term.reference > 0; });
+        bool hasReferences =
+            std::all_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return term.reference > 0; });
         if (firstDensity > 0)
             rhoNext = firstDensity;
         else if (hasReferences)
@@ -585,8 +586,8 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
         evaluateOnStep(qBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext, vBack,
                        lambdaBack, backValues);
     }
-    catch (const DependentConstraints&) {
-        return false;
+    catch (const StepFailure&) {
+        return false; // no state to look back at
     }
     return true;
 }
@@ -599,9 +600,10 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& backValues, bool ha
         if (terms[k].reference > 0)
             areAllTaken = false;
         else if (monitor.isNegligible((int) k, values[k], v))
-            throw StepFailure("monitor " + std::to_string(k) +
-                              " is zero at the first step, which is then no measure for later ones; call calibrate() or "
-                              "setReferenceMonitorValue()");
+            throw StepFailure(
+                "monitor " + std::to_string(k) +
+                " is zero at the first step, which is then no measure for later ones; call calibrate() or "
+                "setReferenceMonitorValue()");
     }
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].reference == 0)

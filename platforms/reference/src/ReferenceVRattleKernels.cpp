@@ -23,7 +23,8 @@ const int NO_MONITOR_GROUP = -1;
                                const std::string& wayOut) {
     std::stringstream message;
     message.precision(10);
-    message << "VariableStepRattleIntegrator: " << what << " at t = " << time << " ps failed because " << reason << wayOut;
+    message << "VariableStepRattleIntegrator: " << what << " at t = " << time << " ps failed because " << reason
+            << wayOut;
     throw OpenMMException(message.str());
 }
 
@@ -31,8 +32,8 @@ void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, co
     for (size_t i = 0; i < vectors.size(); i++)
         for (int j = 0; j < 3; j++)
             if (!std::isfinite(vectors[i][j]) && masses[i] > 0)
-                throw OpenMMException("VariableStepRattleIntegrator: the " + name + " of particle " + std::to_string(i) +
-                                      " is not a finite number; set it before stepping");
+                throw OpenMMException("VariableStepRattleIntegrator: the " + name + " of particle " +
+                                      std::to_string(i) + " is not a finite number; set it before stepping");
 }
 
 } // namespace
@@ -51,6 +52,7 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
                                   " of the System has a length that is not a positive finite number");
     }
     dynamics.reset(new VRattleDynamics(masses, constraints));
+    isContextAhead = false;
     forceGroups = 0;
     monitorForceGroup = NO_MONITOR_GROUP;
     areSettingsChanged = isStateChanged = true;
@@ -116,16 +118,16 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
     try {
         if (isStateChanged)
             startAfresh(context);
-        else if (forcesInvalid || differ(*data.positions, dynamics->getPositions())) {
+        else if (forcesInvalid || differ(*data.positions, knownPositions())) {
             // A Force has changed the state (a barostat, say).
             isStateChanged = true;
+            noteContext();
             double energy = computeForces(context);
             dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
-            writeMoving(dynamics->getVelocities(), *data.velocities);
         }
-        else if (differ(*data.velocities, dynamics->getVelocities())) {
+        else if (differ(*data.velocities, knownVelocities())) {
+            noteContext();
             dynamics->changeVelocities(*data.velocities);
-            writeMoving(dynamics->getVelocities(), *data.velocities);
         }
         isStateChanged = false;
     }
@@ -137,20 +139,47 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
 void ReferenceIntegrateVRattleStepKernel::startAfresh(ContextImpl& context) {
     requireFinite(*data.positions, masses, "position");
     requireFinite(*data.velocities, masses, "velocity");
+    context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
+    noteContext();
     vector<Vec3> positions = *data.positions;
-    if (dynamics->projectPositions(positions)) {
+    bool isProjected = dynamics->projectPositions(positions);
+    if (isProjected) {
         writeMoving(positions, *data.positions);
         context.computeVirtualSites();
     }
-    double energy = computeForces(context);
-    dynamics->begin(*data.positions, *data.velocities, *data.forces, energy);
-    writeMoving(dynamics->getVelocities(), *data.velocities);
+    double energy;
+    try {
+        energy = computeForces(context);
+    }
+    catch (...) {
+        putBack(context);
+        throw;
+    }
+    vector<Vec3> forces = *data.forces;
+    if (isProjected)
+        putBack(context);
+    dynamics->begin(positions, *data.velocities, forces, energy);
+}
+
+void ReferenceIntegrateVRattleStepKernel::noteContext() {
+    isContextAhead = true;
+    contextPositions = *data.positions;
+    contextVelocities = *data.velocities;
+}
+
+const vector<Vec3>& ReferenceIntegrateVRattleStepKernel::knownPositions() const {
+    return isContextAhead ? contextPositions : dynamics->getPositions();
+}
+
+const vector<Vec3>& ReferenceIntegrateVRattleStepKernel::knownVelocities() const {
+    return isContextAhead ? contextVelocities : dynamics->getVelocities();
 }
 
 double ReferenceIntegrateVRattleStepKernel::computeForces(ContextImpl& context) {
     context.calcForcesAndEnergy(true, false, forceGroups);
     numForceEvaluations++;
-    return monitorForceGroup == NO_MONITOR_GROUP ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
+    return monitorForceGroup == NO_MONITOR_GROUP ? 0.0
+                                                 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
 }
 
 bool ReferenceIntegrateVRattleStepKernel::haveBoxVectorsChanged() {
@@ -189,13 +218,13 @@ double ReferenceIntegrateVRattleStepKernel::advance(ContextImpl& context, VRattl
 }
 
 void ReferenceIntegrateVRattleStepKernel::putBack(ContextImpl& context) {
-    writeMoving(dynamics->getPositions(), *data.positions);
+    writeMoving(knownPositions(), *data.positions);
     context.computeVirtualSites();
-    *data.forces = dynamics->getForces();
 }
 
-double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context, const VariableStepRattleIntegrator& integrator,
-                                                    bool forcesInvalid, double maxTime) {
+double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context,
+                                                    const VariableStepRattleIntegrator& integrator, bool forcesInvalid,
+                                                    double maxTime) {
     prepare(context, integrator, forcesInvalid);
     const double maxStep = maxTime - data.time;
     double size;
@@ -212,6 +241,7 @@ double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context, const 
         throw;
     }
     writeMoving(dynamics->getVelocities(), *data.velocities);
+    isContextAhead = false;
     lastDensity = dynamics->getDensity();
     data.time = size < maxStep ? data.time + size : maxTime;
     data.stepCount++;
@@ -228,7 +258,10 @@ void ReferenceIntegrateVRattleStepKernel::reverse(ContextImpl& context,
         throwFailure("reverse()", data.time, failure.what(), "; the Context is unchanged");
     }
     lastDensity = dynamics->getDensity();
-    writeMoving(dynamics->getVelocities(), *data.velocities);
+    for (size_t i = 0; i < masses.size(); i++)
+        if (masses[i] > 0)
+            (*data.velocities)[i] *= -1;
+    contextVelocities = *data.velocities;
 }
 
 vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& context,

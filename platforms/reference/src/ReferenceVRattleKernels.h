@@ -45,6 +45,9 @@ private:
     void readSettings(const VariableStepRattleIntegrator& integrator);
     void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
     void startAfresh(OpenMM::ContextImpl& context);
+    void noteContext();
+    const std::vector<OpenMM::Vec3>& knownPositions() const;
+    const std::vector<OpenMM::Vec3>& knownVelocities() const;
     double advance(OpenMM::ContextImpl& context, VRattleDynamics& method, double maxStep);
     void putBack(OpenMM::ContextImpl& context);
     double computeForces(OpenMM::ContextImpl& context);
@@ -59,6 +62,10 @@ private:
     OpenMM::Vec3 boxVectors[3];
     int forceGroups, monitorForceGroup;
     bool areSettingsChanged, isStateChanged;
+    // The method's state is on the constraints; the Context's may not be, and is left as the user or a Force has made it
+    // until the next step is complete. Then these hold what the Context has.
+    bool isContextAhead;
+    std::vector<OpenMM::Vec3> contextPositions, contextVelocities;
     double lastDensity;
     long long numForceEvaluations;
 };

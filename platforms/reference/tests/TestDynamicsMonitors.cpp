@@ -106,7 +106,8 @@ void testCombinationGradient() {
 void testCombination() {
     // Each term is 1 at its reference, and so is the combination, whatever the weights.
     Example e;
-    vector<StepMonitor::Term> terms = {{StepMonitor::MaxForce, 3.0, 1.0, 1.0}, {StepMonitor::VectorField, 0.5, 0.5, 1.0}};
+    vector<StepMonitor::Term> terms = {{StepMonitor::MaxForce, 3.0, 1.0, 1.0},
+                                       {StepMonitor::VectorField, 0.5, 0.5, 1.0}};
     Evaluation evaluation(e, terms, 8);
     evaluation.u(e.velocities);
     vector<double> values = evaluation.values;
@@ -126,7 +127,8 @@ void testNegligibleMultipliers() {
         e.forces[i] = Vec3(0, -9.8 * e.masses[i], 0);
         e.velocities[i] = Vec3(0.3, 0.4, 0);
     }
-    Evaluation evaluation(e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
+    Evaluation evaluation(
+        e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
     evaluation.u(e.velocities);
     ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities));
     ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities));
