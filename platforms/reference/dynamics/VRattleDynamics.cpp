@@ -234,6 +234,30 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     monitor.requireValid(values);
 }
 
+VRattleDynamics::Memory VRattleDynamics::getMemory() const {
+    Memory memory = {hasDensity, rho, w, multiplierOffset, {}};
+    for (const StepMonitor::Term& term : monitor.getTerms())
+        memory.references.push_back(term.reference);
+    return memory;
+}
+
+void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                             double energy, const Memory& memory) {
+    begin(positions, velocities, forces, energy);
+    v = velocities; // begin() has projected them, which changes the last bits
+    computeMultipliers(v, lambda);
+    monitor.evaluate(v, lambda, jacobian, values);
+    for (size_t k = 0; k < memory.references.size(); k++)
+        monitor.setReference((int) k, memory.references[k]);
+    if (!memory.hasDensity)
+        return;
+    hasDensity = true;
+    rho = memory.density;
+    w = memory.halfStepVelocities;
+    multiplierOffset = memory.multiplierOffset;
+    u = combineAndLimit(values);
+}
+
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
                                   const vector<Vec3>& forces, double energy) {
     const bool hadDensity = hasDensity;

@@ -41,6 +41,15 @@ public:
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
     };
 
+    /** What the next step depends on beside the settings and the state at its start; saved for a restart. */
+    struct Memory {
+        bool hasDensity;
+        double density;                             // rho[n-1/2]
+        std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
+        std::vector<double> multiplierOffset;       // lambda[n-1] - Lambda[n-1], in internal order
+        std::vector<double> references;             // U_k,ref in force
+    };
+
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
 
     /**
@@ -62,6 +71,13 @@ public:
     /** Start afresh at a state. The velocities are projected onto the constraints. */
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    Memory getMemory() const;
+    /**
+     * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
+     * following steps are the same to the last bit if the forces are.
+     */
+    void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
