@@ -78,6 +78,11 @@ public:
      */
     void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                 const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
+    /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
+    void setReferences(const std::vector<double>& references) {
+        for (size_t k = 0; k < references.size(); k++)
+            monitor.setReference((int) k, references[k]);
+    }
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
