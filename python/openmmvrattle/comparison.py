@@ -59,6 +59,8 @@ EVALUATION_TOLERANCE = 0.02
 """Force evaluations count as equal if they differ by less than this fraction."""
 MAXIMUM_ENERGY_SAMPLES = 100_000
 """Longer runs take the energy every few steps only."""
+MAXIMUM_FAILED_TRIES = 5
+"""An integrator whose steps are adjusted may fail this often before it is given up."""
 MAXIMUM_CONSTRAINT_SAMPLES = 2_000
 """How often the constrained distances of a run are measured."""
 
@@ -170,6 +172,8 @@ class _Method:
     first_guess: float
     exponent: float
     """The number of steps is about proportional to the parameter to this power; 0 if the parameter is exact."""
+    calibration_steps: int = 0
+    """Trial steps before the run, which count as force evaluations."""
 
 
 def quick_settings(settings: ComparisonSettings, fraction: float = 0.02, fewest: int = 100) -> ComparisonSettings:
@@ -302,6 +306,7 @@ def _methods(settings: ComparisonSettings) -> list[_Method]:
                 lambda size, control=control: make_integrator(control, size),
                 control.nominal_step_size,
                 -1.0 if control.monitors else 0.0,
+                control.calibration_steps,
             )
         )
     return methods
@@ -349,9 +354,20 @@ def _adjust(
     target = math.log(settings.force_evaluations)
     parameter, exponent = math.log(method.first_guess), method.exponent
     tried: list[tuple[float, float]] = []
+    failed: list[tuple[float, _RunError]] = []
     for attempt in range(12):
         report(f"adjusting, try {attempt + 1}", 0.0)
-        count = _count_steps(method, math.exp(parameter), test_system, platform, settings)
+        try:
+            count = _count_steps(method, math.exp(parameter), test_system, platform, settings)
+        except _RunError as error:
+            # Too large steps can fail: try with twice as many, then four times as many again, and so on.
+            failed.append((parameter, error))
+            if len(failed) == MAXIMUM_FAILED_TRIES:
+                raise
+            longest = max((p for p, c in tried if c > target), default=None)
+            smaller = parameter + len(failed) * math.log(2.0) / exponent
+            parameter = smaller if longest is None else (longest + parameter) / 2
+            continue
         if abs(count / settings.force_evaluations - 1.0) < EVALUATION_TOLERANCE / 2:
             return math.exp(parameter)
         tried.append((parameter, math.log(count)))
@@ -362,11 +378,13 @@ def _adjust(
         parameter += (target - tried[-1][1]) / exponent
         # Steps fall with the parameter: stay between the nearest tries on both sides.
         too_many = [p for p, c in tried if c > target]
-        too_few = [p for p, c in tried if c < target]
+        too_few = [p for p, c in tried if c < target] + [p for p, _ in failed]
         if too_many and too_few and not max(too_many) < parameter < min(too_few):
             parameter = (max(too_many) + min(too_few)) / 2
     nearest = min(tried, key=lambda pair: abs(pair[1] - target))
     if abs(math.exp(nearest[1] - target) - 1.0) > EVALUATION_TOLERANCE:
+        if failed:
+            raise failed[-1][1]
         raise _RunError(
             f"its steps could not be adjusted to {settings.force_evaluations} force evaluations; the nearest was "
             f"{round(math.exp(nearest[1]))}"
@@ -377,7 +395,10 @@ def _adjust(
 def _count_steps(
     method: _Method, parameter: float, test_system: TestSystem, platform: str, settings: ComparisonSettings
 ) -> float:
-    """The number of steps over the whole time; a run that takes far too many is cut short and extrapolated."""
+    """The number of force evaluations over the whole time, those of a calibration included.
+
+    A run that takes far too many steps is cut short and extrapolated.
+    """
     integrator, context = _start(method, parameter, test_system, platform, settings)
     limit = 2 * settings.force_evaluations
     steps, simulated = 0, 0.0
@@ -385,7 +406,8 @@ def _count_steps(
         simulated += _checked_step(integrator, simulated)
         steps += 1
     del context
-    return steps if simulated >= _end_of(settings) else steps * settings.total_time / simulated
+    needed = steps if simulated >= _end_of(settings) else steps * settings.total_time / simulated
+    return needed + method.calibration_steps
 
 
 def _measure(
@@ -494,6 +516,8 @@ def _start(
         if method.method == "fixed":
             velocities = _half_step_back(test_system, context, parameter)
         context.setVelocities(velocities)
+        if method.calibration_steps:
+            integrator.calibrate(method.calibration_steps)
     except Exception as error:
         raise _RunError(_sentence(error)) from error
     return integrator, context

@@ -15,9 +15,11 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import resources
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,10 +34,13 @@ __all__ = [
     "TestSystem",
     "alanine_dipeptide",
     "constraint_error",
+    "diatomic_on_wall",
     "double_pendulum",
     "light_heavy_chain",
+    "nitrogen_collision",
     "project_onto_constraints",
     "rigid_waters",
+    "water_clash",
 ]
 
 
@@ -66,6 +71,8 @@ class StepControl:
     """Upper bound of the steps divided by the nominal step; 0 for no bound."""
     update_method: str = "SemiExplicit"
     """Name of the recursion of the step density, a class constant of the integrator."""
+    calibration_steps: int = 0
+    """Trial steps from which the reference value is taken (``calibrate``); 0 for the value at the first step."""
 
     @property
     def label(self) -> str:
@@ -170,14 +177,19 @@ def double_pendulum(
     )
 
 
-def light_heavy_chain() -> TestSystem:
-    """A linear I-H-I with both bonds rigid and no other force, which is bent and straightens: a whip.
+def light_heavy_chain(repulsion: bool = False) -> TestSystem:
+    """A linear I-H-I with both bonds rigid, which is bent and straightens: a whip.
 
     When the two heavy atoms (126.9 amu) have pulled the chain straight, the hydrogen atom (1.008 amu) between them is
     flung across the line within a fraction of a femtosecond. The two bonds are strongly coupled through the light atom:
     OpenMM's constraint solver CCMA stops before it has met its tolerance here, and VerletIntegrator therefore loses
     energy whatever the tolerance. VariableVerletIntegrator, which takes its steps from the applied force, cannot
-    run at all, since there is none. The energy is 2.4756 kJ/mol.
+    run at all where there is none. The energy is 2.4756 kJ/mol.
+
+    Args:
+        repulsion: whether the heavy atoms repel each other, by the repulsive part of a Lennard-Jones potential
+            (diameter 0.16 nm, depth 1 kJ/mol). Then an applied force sets in suddenly besides the constraint forces.
+            Without it there is no applied force at all.
     """
     system = openmm.System()
     for mass in (126.9, 1.008, 126.9):
@@ -185,6 +197,8 @@ def light_heavy_chain() -> TestSystem:
     length = 0.1609  # nm, the bond of HI
     system.addConstraint(0, 1, length)
     system.addConstraint(1, 2, length)
+    if repulsion:
+        system.addForce(_repulsion(0, 2, diameter=0.16, depth=1.0))
     positions = np.array(
         [
             [-0.13035287991719496, 0.0, 0.0],
@@ -201,26 +215,44 @@ def light_heavy_chain() -> TestSystem:
     )
     positions, velocities = project_onto_constraints(system, positions, velocities)
     return TestSystem(
-        name="light-heavy-chain",
+        name="light-heavy-chain-repulsion" if repulsion else "light-heavy-chain",
         system=system,
         topology=_chain_topology(("I1", "H", "I2"), (app.element.iodine, app.element.hydrogen, app.element.iodine)),
         positions=positions,
         velocities=velocities,
-        description="I-H-I with rigid bonds and no other force",
+        description=f"I-H-I with rigid bonds and {'repulsion' if repulsion else 'no other force'}",
         settings=ComparisonSettings(
             total_time=20.0,
             force_evaluations=16_000,
             controls=(
                 StepControl(
-                    monitors=(MonitorSettings("ConstraintForce"),),
+                    monitors=(MonitorSettings("ConstraintAndAppliedForce" if repulsion else "ConstraintForce"),),
                     nominal_step_size=1.25e-3,
                     smallest_step_ratio=0.01,
-                    largest_step_ratio=10.0,
+                    largest_step_ratio=2.0 if repulsion else 10.0,
                     update_method="Explicit",
                 ),
             ),
         ),
     )
+
+
+def _repulsion(first: int, second: int, diameter: float, depth: float) -> openmm.Force:
+    """The repulsive part of a Lennard-Jones potential between two particles, zero beyond its minimum.
+
+    Args:
+        first: index of one particle.
+        second: index of the other.
+        diameter: where the Lennard-Jones potential is zero, nm.
+        depth: of its minimum, kJ/mol.
+    """
+    force = openmm.CustomBondForce(
+        "step(2^(1/6)*diameter-r)*(4*depth*((diameter/r)^12-(diameter/r)^6)+depth)",
+    )
+    force.addPerBondParameter("diameter")
+    force.addPerBondParameter("depth")
+    force.addBond(first, second, [diameter, depth])
+    return force
 
 
 # ACE-ALA-NME near the minimum of amber14 in vacuum: residue, atom, x, y, z in nm.
@@ -265,6 +297,7 @@ def alanine_dipeptide(constraints: Any = app.HBonds, temperature: float = 300.0,
         The molecule after a short equilibration at the temperature.
     """
     names = {app.HBonds: "hbonds", app.AllBonds: "allbonds"}
+    suffix = "" if temperature == 300.0 else f"-{temperature:g}-kelvin"
     if constraints not in names:
         raise ValueError("constraints must be openmm.app.HBonds or openmm.app.AllBonds")
     topology = app.Topology()
@@ -281,12 +314,12 @@ def alanine_dipeptide(constraints: Any = app.HBonds, temperature: float = 300.0,
     positions = np.array([row[2:] for row in _ALANINE_DIPEPTIDE])
     positions, velocities = _equilibrated(system, positions, temperature, seed)
     return TestSystem(
-        name=f"alanine-dipeptide-{names[constraints]}",
+        name=f"alanine-dipeptide-{names[constraints]}{suffix}",
         system=system,
         topology=topology,
         positions=positions,
         velocities=velocities,
-        description=f"alanine dipeptide in vacuum, {system.getNumConstraints()} rigid bonds",
+        description=f"alanine dipeptide in vacuum, {system.getNumConstraints()} rigid bonds, {temperature:g} K",
         settings=ComparisonSettings(total_time=2.0, force_evaluations=2000, controls=_MOLECULAR_CONTROLS),
     )
 
@@ -323,7 +356,7 @@ def rigid_waters(n: int = 8, temperature: float = 300.0, seed: int = 8) -> TestS
     positions = np.concatenate([coordinates[molecules[i]] for i in nearest])
     positions, velocities = _equilibrated(system, positions - positions.mean(axis=0), temperature, seed)
     return TestSystem(
-        name="rigid-waters",
+        name="rigid-waters" if n == 8 else f"rigid-waters-{n}",
         system=system,
         topology=topology,
         positions=positions,
@@ -332,6 +365,133 @@ def rigid_waters(n: int = 8, temperature: float = 300.0, seed: int = 8) -> TestS
         settings=ComparisonSettings(total_time=2.0, force_evaluations=2000, controls=_MOLECULAR_CONTROLS),
     )
 
+
+# TIP3P: diameter and depth of the Lennard-Jones potential of O (nm, kJ/mol), charges of O and H.
+_WATER_LENNARD_JONES = (0.315061, 0.6364)
+_WATER_CHARGES = (-0.834, 0.417)
+_WATER_BONDS = ((0, 1, 0.09572), (0, 2, 0.09572), (1, 2, 0.15139006545273223))
+
+
+def water_clash() -> TestSystem:
+    """Eight rigid water molecules, two of which overlap: a clash as in a badly built start.
+
+    Two oxygen atoms are at half their Lennard-Jones diameter, where the repulsion is some 10,000 times that of thermal
+    contacts. It drives the molecules apart within a few fs, and they strike their neighbours. Almost all of the
+    difficulty lies in the applied force of two atoms, and most of it in the first moments, so monitors that see single
+    particles pay here. The positions and velocities are in data/water_clash.json of this package.
+    """
+    data = json.loads((resources.files("openmmvrattle") / "data" / "water_clash.json").read_text(encoding="utf-8"))
+    masses = data["masses"]
+    molecules = len(masses) // 3
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    for particle, mass in enumerate(masses):
+        system.addParticle(mass)
+        is_oxygen = particle % 3 == 0
+        diameter, depth = _WATER_LENNARD_JONES if is_oxygen else (1.0, 0.0)
+        force.addParticle(_WATER_CHARGES[0] if is_oxygen else _WATER_CHARGES[1], diameter, depth)
+    topology = app.Topology()
+    chain = topology.addChain()
+    for molecule in range(molecules):
+        residue = topology.addResidue("HOH", chain)
+        for name in ("O", "H1", "H2"):
+            topology.addAtom(name, app.Element.getBySymbol(name[0]), residue)
+        for first, second, distance in _WATER_BONDS:
+            system.addConstraint(3 * molecule + first, 3 * molecule + second, distance)
+            force.addException(3 * molecule + first, 3 * molecule + second, 0.0, 1.0, 0.0)
+    topology.createStandardBonds()
+    system.addForce(force)
+    return TestSystem(
+        name="water-clash",
+        system=system,
+        topology=topology,
+        positions=np.array(data["positions"]),
+        velocities=np.array(data["velocities"]),
+        description=f"{molecules} rigid water molecules, two of which overlap",
+        settings=ComparisonSettings(total_time=0.2, force_evaluations=800, controls=(_COLLISION_CONTROL,)),
+    )
+
+
+# Nitrogen: the bond (nm), and diameter and depth of the Lennard-Jones potential between atoms (nm, kJ/mol).
+_NITROGEN_BOND = 0.1098
+_NITROGEN_LENNARD_JONES = (0.331, 0.2993)
+
+
+def nitrogen_collision(speed: float = 5.0) -> TestSystem:
+    """Two rigid N2 molecules that meet at high speed, as in a shock wave or a hot plasma.
+
+    They start 1.2 nm apart, do not turn, and meet 0.1 nm off the centre. Before and after the collision there is hardly
+    any force, so only a monitor that rises early enough helps.
+
+    Args:
+        speed: their relative speed, in nm/ps, which is km/s.
+    """
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    for _ in range(4):
+        system.addParticle(14.007)
+        force.addParticle(0.0, *_NITROGEN_LENNARD_JONES)
+    for first in (0, 2):
+        system.addConstraint(first, first + 1, _NITROGEN_BOND)
+        force.addException(first, first + 1, 0.0, 1.0, 0.0)
+    system.addForce(force)
+    half = 0.5 * _NITROGEN_BOND
+    axes = [np.array([math.cos(angle), math.sin(angle), 0.0]) for angle in (0.7, 2.0)]
+    centres = [np.array([-0.6, 0.05, 0.0]), np.array([0.6, -0.05, 0.0])]
+    positions = [
+        centre + sign * half * axis for centre, axis in zip(centres, axes, strict=True) for sign in (-1.0, 1.0)
+    ]
+    velocities = np.zeros((4, 3))
+    velocities[:2, 0], velocities[2:, 0] = 0.5 * speed, -0.5 * speed
+    topology = app.Topology()
+    chain = topology.addChain()
+    for _ in range(2):
+        residue = topology.addResidue("N2", chain)
+        topology.addBond(*(topology.addAtom(name, app.element.nitrogen, residue) for name in ("N1", "N2")))
+    return TestSystem(
+        name=f"nitrogen-collision-{speed:g}",
+        system=system,
+        topology=topology,
+        positions=np.array(positions),
+        velocities=velocities,
+        description=f"two rigid N2 molecules that collide at {speed:g} km/s",
+        settings=ComparisonSettings(total_time=2.0 / speed, force_evaluations=400, controls=(_COLLISION_CONTROL,)),
+    )
+
+
+def diatomic_on_wall(speed: float = 2.0) -> TestSystem:
+    """A rigid N2 molecule that flies against a wall, aslant, and comes back turning.
+
+    The wall is the plane x = 0 and repels each atom with depth (0.25 nm / x)^12 of 1 kJ/mol at 0.25 nm.
+
+    Args:
+        speed: the speed of the molecule towards the wall, in nm/ps.
+    """
+    system = openmm.System()
+    wall = openmm.CustomExternalForce("(0.25/x)^12")
+    for particle in range(2):
+        system.addParticle(14.007)
+        wall.addParticle(particle)
+    system.addConstraint(0, 1, _NITROGEN_BOND)
+    system.addForce(wall)
+    axis = np.array([math.cos(0.6), math.sin(0.6), 0.0])
+    centre = np.array([0.9, 0.0, 0.0])
+    half = 0.5 * _NITROGEN_BOND
+    topology = _chain_topology(("N1", "N2"), (app.element.nitrogen, app.element.nitrogen))
+    return TestSystem(
+        name="diatomic-on-wall",
+        system=system,
+        topology=topology,
+        positions=np.array([centre - half * axis, centre + half * axis]),
+        velocities=np.tile([-speed, 0.0, 0.0], (2, 1)),
+        description=f"a rigid N2 molecule that flies against a wall at {speed:g} km/s",
+        settings=ComparisonSettings(total_time=2.0 / speed, force_evaluations=400, controls=(_COLLISION_CONTROL,)),
+    )
+
+
+_COLLISION_CONTROL = StepControl(
+    monitors=(MonitorSettings("ForcePNorm", power=0.5),), nominal_step_size=1e-3, update_method="Explicit"
+)
 
 _MOLECULAR_CONTROLS = (
     StepControl(monitors=(MonitorSettings("ConstraintMultipliers"),), nominal_step_size=1e-3),
@@ -342,9 +502,16 @@ SYSTEMS: dict[str, Callable[[], TestSystem]] = {
     "double-pendulum": double_pendulum,
     "double-pendulum-heavy-inside": functools.partial(double_pendulum, inner_mass=1000.0, outer_mass=1.0),
     "light-heavy-chain": light_heavy_chain,
+    "light-heavy-chain-repulsion": functools.partial(light_heavy_chain, repulsion=True),
+    "water-clash": water_clash,
+    "nitrogen-collision-5": nitrogen_collision,
+    "nitrogen-collision-20": functools.partial(nitrogen_collision, 20.0),
+    "diatomic-on-wall": diatomic_on_wall,
     "alanine-dipeptide-hbonds": functools.partial(alanine_dipeptide, app.HBonds),
+    "alanine-dipeptide-hbonds-1000-kelvin": functools.partial(alanine_dipeptide, app.HBonds, temperature=1000.0),
     "alanine-dipeptide-allbonds": functools.partial(alanine_dipeptide, app.AllBonds),
     "rigid-waters": rigid_waters,
+    "rigid-waters-32": functools.partial(rigid_waters, 32),
 }
 """The systems by the names under which the command line knows them; each value is called without arguments."""
 
@@ -454,6 +621,4 @@ def _chain_topology(names: tuple[str, ...], elements: tuple[Any, ...] | None = N
 
 def _openmm_data_file(name: str) -> str:
     """The path of a file among the data that ship with openmm.app."""
-    from importlib import resources
-
     return str(resources.files(app) / "data" / name)

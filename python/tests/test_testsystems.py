@@ -3,6 +3,7 @@
 """The systems start where their descriptions say, and on their constraints."""
 
 import dataclasses
+import math
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import openmm
 import pytest
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator, testsystems
+from openmmvrattle.comparison import make_integrator
 from openmmvrattle.testsystems import SYSTEMS
 
 
@@ -101,6 +103,73 @@ def test_chain_energy_is_kinetic():
     chain = testsystems.light_heavy_chain()
     assert kinetic_energy(chain) == pytest.approx(2.4756, abs=1e-4)
     assert potential_energy(chain) == 0.0
+
+
+def test_repulsion_acts_at_short_range_only():
+    chain = testsystems.light_heavy_chain(repulsion=True)
+    assert potential_energy(chain) == 0.0
+    contact = 2 ** (1 / 6) * 0.16
+    energies = []
+    for distance in (0.16, 0.5 * (0.16 + contact), contact - 1e-6, contact + 1e-6):
+        places = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [distance, 0.0, 0.0]])
+        energies.append(potential_energy(dataclasses.replace(chain, positions=places)))
+    assert energies[0] == pytest.approx(1.0, rel=1e-9)
+    assert energies[0] > energies[1] > energies[2] >= 0.0 == energies[3]
+    assert energies[2] < 1e-6
+
+
+def test_water_clash_has_one_overlap():
+    clash = testsystems.water_clash()
+    oxygens = clash.positions[::3]
+    distances = sorted(np.linalg.norm(oxygens[i] - oxygens[j]) for i in range(len(oxygens)) for j in range(i))
+    assert len(oxygens) == 8
+    assert distances[0] == pytest.approx(0.5 * 0.315061, rel=1e-6)
+    assert distances[1] > 0.22
+    assert potential_energy(clash) > 5000.0
+
+
+def test_water_clash_has_the_forces_of_the_water_model():
+    """Apart from the overlap it is the model that rigid_waters takes from OpenMM's force field."""
+    clash, waters = testsystems.water_clash(), testsystems.rigid_waters(8)
+    assert masses_of(clash.system) == pytest.approx(masses_of(waters.system), rel=1e-4)
+    spread = dataclasses.replace(clash, positions=waters.positions)
+    assert potential_energy(spread) == pytest.approx(potential_energy(waters), rel=1e-3)
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0])
+def test_nitrogen_molecules_meet(speed):
+    collision = testsystems.nitrogen_collision(speed)
+    assert kinetic_energy(collision) == pytest.approx(0.5 * 4 * 14.007 * (0.5 * speed) ** 2)
+    assert abs(potential_energy(collision)) < 0.1
+    nearest, _ = nearest_approach(collision, lambda places: np.linalg.norm(places[:2].mean(0) - places[2:].mean(0)))
+    assert nearest < 0.4
+
+
+def test_molecule_comes_back_from_the_wall():
+    flight = testsystems.diatomic_on_wall()
+    nearest, places = nearest_approach(flight, lambda places: places[:, 0].min())
+    assert 0.1 < nearest < 0.3
+    assert places[:, 0].min() > 0.3
+
+
+def nearest_approach(test_system, distance):
+    """The smallest distance along a run with the recommended settings, and the positions at its end."""
+    settings = test_system.settings
+    integrator = make_integrator(settings.controls[0], 0.2 * settings.total_time / settings.force_evaluations)
+    context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(test_system.positions)
+    context.setVelocities(test_system.velocities)
+    nearest = math.inf
+    while context.getTime()._value < settings.total_time:
+        integrator.step(1)
+        places = context.getState(getPositions=True).getPositions(asNumpy=True)._value
+        nearest = min(nearest, distance(places))
+    return nearest, places
+
+
+def test_hot_alanine_dipeptide_is_hot():
+    molecule = SYSTEMS["alanine-dipeptide-hbonds-1000-kelvin"]()
+    assert 600 < 2 * kinetic_energy(molecule) / ((3 * 22 - 12) * 8.31446e-3) < 1400
 
 
 @pytest.mark.parametrize(("constraints", "number"), [(app.HBonds, 12), (app.AllBonds, 21)])
