@@ -6,19 +6,17 @@
 
 #include "ConstraintSystem.h"
 #include "StepFailure.h"
-#include <Eigen/SparseCholesky>
-#include <Eigen/SparseCore>
-#include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * The constraint matrix K = G M^-1 G^T and its factorisation L D L^T, block by block: one block a cluster. The pattern is
- * analysed once; each factorisation computes the values in place and costs time linear in the number of constraints.
+ * The constraint matrix K = G M^-1 G^T and its factorisation L D L^T, in the internal order of the constraints, which is
+ * an order of elimination with little fill. Where each number goes is worked out once; a factorisation then runs through a fixed
+ * schedule, allocates nothing, and costs time linear in the number of entries of L, that is, of constraints.
  *
- * Small clusters (rigid molecules, CH_n groups) are factorised as dense blocks, large ones (chains, proteins with all
- * bonds fixed) with a sparse factorisation in a fill-reducing order.
+ * As ConstraintSystem, factorize() and solve() take a first constraint from which on they work. It must be 0 or
+ * getFirstGeneral().
  */
 class ConstraintMatrix {
 public:
@@ -26,34 +24,28 @@ public:
     /**
      * Compute and factorise K for a Jacobian.
      *
-     * @throws DependentConstraints    if a pivot D_k is not larger than 1e-10 K_kk: the constraints of that cluster
-     *                                 depend on each other
+     * @throws DependentConstraints    if a pivot D_k is not larger than MIN_RELATIVE_PIVOT K_kk: the constraints of
+     *                                 that cluster depend on each other
      */
-    void factorize(const ConstraintSystem::Jacobian& jacobian);
+    void factorize(const ConstraintSystem::Jacobian& jacobian, int first = 0);
     /** Replace x by K^-1 x. */
-    void solve(std::vector<double>& x) const;
+    void solve(std::vector<double>& x, int first = 0) const;
+    /**
+     * A pivot below this fraction of its diagonal entry means dependent constraints. Dependent sets leave pivots of
+     * 1e-16 or negative ones, while a legitimate chain of mass ratio R gives 2/R.
+     */
+    static constexpr double MIN_RELATIVE_PIVOT = 1e-10;
 
 private:
-    typedef Eigen::SparseMatrix<double> SparseMatrix;
-    struct DenseBlock {
-        int cluster, first, size;
-        size_t offset; // of the block's size*size values, by rows, of which the lower triangle is used
-    };
-    struct SparseBlock {
-        int cluster, first, size;
-        SparseMatrix matrix; // the lower triangle
-        Eigen::SimplicialLDLT<SparseMatrix, Eigen::Lower> factor;
-    };
-    void createSparsePattern(SparseBlock& block, size_t firstCoupling, size_t endCoupling);
-    void factorizeDense(const DenseBlock& block);
-    void factorizeSparse(SparseBlock& block);
-    [[noreturn]] void throwDependent(int cluster) const;
     const ConstraintSystem& system;
-    std::vector<DenseBlock> denseBlocks;
-    std::vector<std::unique_ptr<SparseBlock>> sparseBlocks;
-    std::vector<double> denseValues, diagonal;
-    std::vector<double*> slots; // where the coupling of the same index is added up
-    mutable Eigen::VectorXd scratch;
+    size_t firstGeneralCoupling;
+    std::vector<size_t> columnStart;  // of the entries of L below the diagonal
+    std::vector<int> rows;            // of these entries
+    std::vector<size_t> updateStart;  // of the updates that the elimination of a column makes
+    std::vector<size_t> updates;      // where they go: an entry below the diagonal, or numEntries + the row on it
+    std::vector<size_t> couplingSlots;
+    std::vector<double> values;       // the entries below the diagonal, then the diagonal
+    std::vector<double> inversePivots, columnScratch;
 };
 
 } // namespace OpenMMVRattle

@@ -5,9 +5,12 @@
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
 #include "openmm/Vec3.h"
+#include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
+
+class ClusterBatch;
 
 /** The distance between two particles is fixed: |q1 - q2| = length (nm). */
 struct DistanceConstraint {
@@ -23,7 +26,9 @@ struct DistanceConstraint {
  * particle 2. A multiplier of this form is 2 L^2 times the multiplier of |r|^2 - L^2; see toDistanceMultiplier().
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
- * neighbours. Constraints between two particles of mass zero cannot move anything and are left out.
+ * neighbours: first the small clusters that come in batches of one shape, then the general ones. The functions below take
+ * a first constraint and work on those from there on: 0 for all, getFirstGeneral() for the general clusters. Constraints
+ * between two particles of mass zero cannot move anything and are left out.
  */
 class ConstraintSystem {
 public:
@@ -44,6 +49,7 @@ public:
      * @param constraints    the distance constraints
      */
     ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+    ~ConstraintSystem();
 
     int getNumParticles() const {
         return (int) masses.size();
@@ -71,30 +77,47 @@ public:
     const std::vector<Coupling>& getCouplings() const {
         return couplings;
     }
+    /** The batches of small clusters, whose constraints come first in the internal order. */
+    const std::vector<std::unique_ptr<ClusterBatch>>& getBatches() const {
+        return batches;
+    }
+    /** The first constraint that is in no batch. */
+    int getFirstGeneral() const {
+        return firstGeneral;
+    }
+    /** The particles with mass whose cluster is in no batch. */
+    const std::vector<int>& getGeneralParticles() const {
+        return generalParticles;
+    }
+    /** The particles with mass that have no constraint. */
+    const std::vector<int>& getFreeParticles() const {
+        return freeParticles;
+    }
     /** The particles of a cluster, in increasing order. */
     std::vector<int> getClusterParticles(int cluster) const;
 
     /** g(q) in g; returns max |g|, the largest relative error of a constraint (or a NaN). */
-    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g) const;
+    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, int first = 0) const;
     /** The index of the constraint with the largest |g|. */
     int findLargest(const std::vector<double>& g) const;
     /**
      * G(x): for x = q the Jacobian, for x = v the matrix whose rows are (d^2g/dq^2 v)^T, since a distance constraint
      * is quadratic (paper, Lemma 4.1).
      */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian) const;
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, int first = 0) const;
     /** G w. */
-    void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result) const;
+    void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
+                  int first = 0) const;
     /** G M^-1 f. */
     void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f,
-                          std::vector<double>& result) const;
+                          std::vector<double>& result, int first = 0) const;
     /** result += G^T x, as forces on the particles. */
     void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
     /** result += scale M^-1 G^T x. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
-                               std::vector<OpenMM::Vec3>& result) const;
+                               std::vector<OpenMM::Vec3>& result, int first = 0) const;
     /** g''(v,v), the second derivative of the constraints along v. */
-    void evaluateCurvature(const std::vector<OpenMM::Vec3>& v, std::vector<double>& result) const;
+    void evaluateCurvature(const std::vector<OpenMM::Vec3>& v, std::vector<double>& result, int first = 0) const;
     /** The factor that turns a multiplier of constraint index into that of |r|^2 - L^2 (kJ/mol/nm^2). */
     double toDistanceMultiplier(int index) const {
         return distanceMultiplierFactors[index];
@@ -103,15 +126,20 @@ public:
     void getDistanceMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
 
 private:
-    void findClusters(const std::vector<DistanceConstraint>& given, const std::vector<int>& active);
+    std::vector<std::vector<int>> findClusters(const std::vector<DistanceConstraint>& given) const;
+    void orderForElimination(const std::vector<DistanceConstraint>& given, std::vector<int>& cluster) const;
+    void appendCluster(const std::vector<DistanceConstraint>& given, const std::vector<int>& cluster);
     void findCouplings();
-    int numGivenConstraints;
+    void classifyParticles(const std::vector<char>& isInBatch);
+    int numGivenConstraints, firstGeneral;
     std::vector<double> masses, inverseMasses;
     std::vector<DistanceConstraint> constraints;
     std::vector<int> givenIndex; // internal order -> order of the constructor
     std::vector<double> inverseSquareLengths, distanceMultiplierFactors;
     std::vector<Cluster> clusters;
     std::vector<Coupling> couplings;
+    std::vector<std::unique_ptr<ClusterBatch>> batches;
+    std::vector<int> generalParticles, freeParticles;
 };
 
 } // namespace OpenMMVRattle

@@ -33,7 +33,7 @@ bool usesMultipliers(StepMonitor::Kind kind) {
     return usesConstraintsOnly(kind) || kind == StepMonitor::ConstraintAndAppliedForce;
 }
 
-bool usesVelocities(StepMonitor::Kind kind) {
+bool isOfVelocities(StepMonitor::Kind kind) {
     return kind == StepMonitor::VectorField || kind == StepMonitor::ArcLength ||
            kind == StepMonitor::MaxParticleArcLength;
 }
@@ -42,8 +42,7 @@ bool usesVelocities(StepMonitor::Kind kind) {
 
 StepMonitor::StepMonitor(const ConstraintSystem& system) :
         system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
-        maxForce(0), forcePNorm(0), constraintForceSquared(0), constraintForces(system.getNumParticles()),
-        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
+        maxForce(0), forcePNorm(0), constraintForceSquared(0), toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
         velocityJacobian(system.getNumConstraints()) {
 }
 
@@ -71,7 +70,11 @@ void StepMonitor::requireValid(const vector<double>& values) const {
 
 bool StepMonitor::dependsOnVelocities() const {
     return std::any_of(terms.begin(), terms.end(),
-                       [](const Term& term) { return usesMultipliers(term.kind) || usesVelocities(term.kind); });
+                       [](const Term& term) { return usesMultipliers(term.kind) || isOfVelocities(term.kind); });
+}
+
+bool StepMonitor::usesVelocities() const {
+    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return isOfVelocities(term.kind); });
 }
 
 void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
@@ -96,25 +99,104 @@ void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
         });
 }
 
-void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers,
-                           const ConstraintSystem::Jacobian& jacobian, vector<double>& values) {
-    bool needsConstraintForce = false;
-    for (const Term& term : terms)
-        needsConstraintForce |= term.kind == ConstraintForce || term.kind == ConstraintAndAppliedForce;
-    if (needsConstraintForce) {
-        // Lambda^T K Lambda = |M^-1/2 G^T Lambda|^2
-        std::fill(constraintForces.begin(), constraintForces.end(), Vec3());
-        system.addTransposed(jacobian, multipliers, constraintForces);
-        constraintForceSquared = 0;
-        for (int i = 0; i < system.getNumParticles(); i++)
-            constraintForceSquared += constraintForces[i].dot(constraintForces[i]) * system.getInverseMasses()[i];
-    }
+void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const vector<double>& rightSide,
+                           vector<double>& values) {
+    // Lambda^T K Lambda; rounding could make it negative where it vanishes.
+    double sum = 0;
+    for (size_t k = 0; k < multipliers.size(); k++)
+        sum += multipliers[k] * rightSide[k];
+    constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
     values.resize(terms.size());
     for (size_t i = 0; i < terms.size(); i++)
         values[i] = evaluateTerm(terms[i], v, multipliers);
 }
 
-double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const vector<double>& multipliers) {
+// du/dU_k
+double StepMonitor::derivativeOfU(size_t index, const vector<double>& values, double u) const {
+    const Term& term = terms[index];
+    // U is not differentiable at zero; any value serves, since it only guides the iteration.
+    if (!(values[index] > 0) || !(u > 0))
+        return 0;
+    double sumOfWeights = 0;
+    for (const Term& each : terms)
+        sumOfWeights += each.weight * each.weight;
+    double t = term.weight * std::pow(values[index] / term.reference, term.power);
+    return t * t * term.power / (values[index] * u * sumOfWeights);
+}
+
+int StepMonitor::findFastest(const vector<Vec3>& v) const {
+    int fastest = 0;
+    double largest = -1;
+    for (int i = 0; i < system.getNumParticles(); i++) {
+        double square = v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]);
+        if (system.getInverseMasses()[i] > 0 && square > largest) {
+            largest = square;
+            fastest = i;
+        }
+    }
+    return fastest;
+}
+
+double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& multipliers,
+                                 const vector<double>& rightSide, const vector<double>& values,
+                                 const vector<Vec3>& velocityRate, const vector<double>& multiplierRate) const {
+    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+    const double u = combine(values);
+    double rate = 0;
+    for (size_t i = 0; i < terms.size(); i++) {
+        const double factor = derivativeOfU(i, values, u), value = values[i];
+        if (factor == 0)
+            continue;
+        double sum = 0;
+        switch (terms[i].kind) {
+        case ConstraintMultipliers:
+            for (int k = 0; k < numConstraints; k++) {
+                double d = system.toDistanceMultiplier(k);
+                sum += d * d * multipliers[k] * multiplierRate[k];
+            }
+            rate += factor * sum / value;
+            break;
+        case MultiplierPNorm:
+            for (int k = 0; k < numConstraints; k++) {
+                double x = system.toDistanceMultiplier(k) * multipliers[k];
+                sum += std::copysign(std::pow(std::fabs(x) / value, normOrder - 1), x) *
+                       system.toDistanceMultiplier(k) * multiplierRate[k];
+            }
+            rate += factor * sum;
+            break;
+        case ConstraintForce:
+        case ConstraintAndAppliedForce:
+            for (int k = 0; k < numConstraints; k++)
+                sum += rightSide[k] * multiplierRate[k];
+            rate += factor * sum / value;
+            break;
+        case VectorField:
+            for (int p = 0; p < numParticles; p++)
+                sum += system.getMasses()[p] * v[p].dot(velocityRate[p]);
+            rate += factor * sum / value;
+            break;
+        case ArcLength:
+            for (int p = 0; p < numParticles; p++)
+                if (system.getMasses()[p] > 0)
+                    sum += v[p].dot(velocityRate[p]);
+            rate += factor * sum / value;
+            break;
+        case MaxParticleArcLength: {
+            const int fastest = findFastest(v);
+            rate += factor * v[fastest].dot(velocityRate[fastest]) / value;
+            break;
+        }
+        case AppliedForce:
+        case ForcePNorm:
+        case MaxForce:
+        case ForceGroupEnergy:
+            break;
+        }
+    }
+    return rate;
+}
+
+double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const vector<double>& multipliers) const {
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     auto distanceMultiplier = [&](int k) { return multipliers[k] * system.toDistanceMultiplier(k); };
@@ -208,16 +290,11 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& 
     std::fill(solved.begin(), solved.end(), 0.0);
     bool mustSolve = false;
     const double u = combine(values);
-    double sumOfWeights = 0;
-    for (const Term& term : terms)
-        sumOfWeights += term.weight * term.weight;
     for (size_t i = 0; i < terms.size(); i++) {
         const Term& term = terms[i];
-        const double value = values[i];
-        if (!(value > 0) || !(u > 0))
-            continue; // U is not differentiable at zero; any value serves, since it only guides the iteration
-        double t = term.weight * std::pow(value / term.reference, term.power);
-        const double factor = t * t * term.power / (value * u * sumOfWeights); // du/dU_k
+        const double value = values[i], factor = derivativeOfU(i, values, u);
+        if (factor == 0)
+            continue;
         switch (term.kind) {
         case ConstraintMultipliers:
             mustSolve = true;
@@ -250,16 +327,8 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& 
                     gradient[p] += v[p] * (factor / value);
             break;
         case MaxParticleArcLength: {
-            int largest = 0;
-            double largestSquare = -1;
-            for (int p = 0; p < numParticles; p++) {
-                double square = v[p].dot(v[p]) + (*forces)[p].dot((*forces)[p]);
-                if (masses[p] > 0 && square > largestSquare) {
-                    largestSquare = square;
-                    largest = p;
-                }
-            }
-            gradient[largest] += v[largest] * (factor / value);
+            const int fastest = findFastest(v);
+            gradient[fastest] += v[fastest] * (factor / value);
             break;
         }
         case AppliedForce:

@@ -59,6 +59,8 @@ public:
     void requireValid(const std::vector<double>& values) const;
     /** Whether any term changes with the velocities at fixed positions. */
     bool dependsOnVelocities() const;
+    /** Whether any term does so other than through the multipliers. */
+    bool usesVelocities() const;
 
     /**
      * Take over the forces at new positions, on which the following evaluations are based.
@@ -67,6 +69,10 @@ public:
      * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
      */
     void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** The forces of the last setForces(). */
+    const std::vector<OpenMM::Vec3>& getForces() const {
+        return *forces;
+    }
     /** The forces of the last setForces() now lie elsewhere. */
     void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
         forces = &newForces;
@@ -76,11 +82,24 @@ public:
      *
      * @param v              the velocities (nm/ps)
      * @param multipliers    Lambda(q,p) at these velocities
-     * @param jacobian       G(q)
+     * @param rightSide      K Lambda = g''(v,v) + G M^-1 F
      * @param values         U_k
      */
     void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
-                  const ConstraintSystem::Jacobian& jacobian, std::vector<double>& values);
+                  const std::vector<double>& rightSide, std::vector<double>& values);
+    /**
+     * The derivative of u along a change of the velocities, at the state of the last evaluate().
+     *
+     * @param v                 as in evaluate()
+     * @param multipliers       as in evaluate()
+     * @param rightSide         as in evaluate()
+     * @param values            what evaluate() gave
+     * @param velocityRate      the change of v
+     * @param multiplierRate    the change of Lambda that goes with it
+     */
+    double evaluateRate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                        const std::vector<double>& rightSide, const std::vector<double>& values,
+                        const std::vector<OpenMM::Vec3>& velocityRate, const std::vector<double>& multiplierRate) const;
     /** Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls. */
     bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v) const;
     /** u, the combination of the values; 1 if there is no term. */
@@ -99,13 +118,15 @@ public:
                           std::vector<OpenMM::Vec3>& gradient);
 
 private:
-    double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers);
+    double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v,
+                        const std::vector<double>& multipliers) const;
+    double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
+    int findFastest(const std::vector<OpenMM::Vec3>& v) const;
     const ConstraintSystem& system;
     std::vector<Term> terms;
     double normOrder;
     const std::vector<OpenMM::Vec3>* forces;
     double groupEnergy, appliedForceSquared, forceSquared, maxForce, forcePNorm, constraintForceSquared;
-    std::vector<OpenMM::Vec3> constraintForces;
     std::vector<double> toSolve, solved;
     ConstraintSystem::Jacobian velocityJacobian;
 };

@@ -13,17 +13,16 @@ using std::vector;
 
 namespace {
 
-const int MAX_ITERATIONS = 50;
-// If an iteration leaves more than this fraction of the error, the chord matrix K(q) is a poor one: use full Newton.
-const double SLOW_CONVERGENCE = 0.25;
-// The density equation (3.14) is solved to this relative accuracy; rounding of U allows little more.
-const double DENSITY_TOLERANCE = 1e-12;
+const int MAX_CHORD_ITERATIONS = 12, MAX_NEWTON_ITERATIONS = 50;
+// If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
+const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 // The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
 // starting value is worse by a power of h, to this. What is left is not the same forwards and backwards, and so limits
 // how closely a run can be retraced; where rounding does not allow the fraction, the tolerance itself counts.
 const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
-// What is accepted where rounding in U (strained, badly scaled constraints) keeps the iteration from going on.
-const double DENSITY_ROUNDING = 1e-8;
+// The density equation (3.14) is solved to the tolerance of the constraints, but not closer than rounding of U allows; and
+// where strained, badly scaled constraints make that rounding larger, the second number counts.
+const double DENSITY_ROUNDING = 1e-13, STRAINED_DENSITY_ROUNDING = 1e-8;
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
 
@@ -45,17 +44,23 @@ bool isFinite(const vector<Vec3>& vectors) {
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
         system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), settings(), groupEnergy(0),
-        rho(1), u(1), hasDensity(false), isFactorCurrent(false), firstDensity(0), stepKind(First), rhoNext(1),
-        stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
+        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), firstDensity(0),
+        factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
+        halfStepValueNext(0), rateNext(0), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
-    for (vector<Vec3>* vectors : {&qNext, &wNext, &vNext, &forceNext, &acceleration, &gradient, &halfStepChange, &qBack,
-                                  &wBack, &vBack, &forceBack, &w})
+    for (int i = 0; i < numParticles; i++)
+        if (masses[i] > 0)
+            movingParticles.push_back(i);
+    for (vector<Vec3>* vectors : {&w, &qNext, &wNext, &vNext, &acceleration, &gradient, &halfStepChange, &qBack, &wBack,
+                                  &vBack, &forceBack})
         vectors->resize(numParticles);
-    for (vector<double>* numbers : {&lambda, &appliedTerm, &lambdaNext, &multiplierTrial, &residual, &correction,
-                                    &coupling, &response, &lambdaBack, &multiplierOffset})
+    for (vector<double>* numbers :
+         {&lambda, &rightSide, &multiplierOffset, &appliedTerm, &lambdaNext, &rightSideNext, &appliedTermNext,
+          &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction, &coupling,
+          &response, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
-    jacobian.resize(numConstraints);
-    jacobianNext.resize(numConstraints);
+    for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
+        rows->resize(numConstraints);
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
@@ -84,15 +89,20 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
     if (q.empty() || sameDensity)
         return;
-    restoreFactor();
     monitor.setForces(force, groupEnergy);
-    monitor.evaluate(v, lambda, jacobian, values);
+    monitor.evaluate(v, lambda, rightSide, values);
+    rate = 0; // only the speed of convergence of the next step depends on it
     if (!sameTerms || retakeReference)
         forgetDensity();
     else
         rescaleDensity(u);
     if (hasDensity)
         formHalfStepVelocities();
+}
+
+// Whether the density is solved for together with the constraints, which takes u at half-step momenta.
+bool VRattleDynamics::needsHalfStepValue() const {
+    return settings.update == StepDensity::SemiExplicit && !settings.isFixedStep && monitor.dependsOnVelocities();
 }
 
 void VRattleDynamics::forgetDensity() {
@@ -125,72 +135,138 @@ void VRattleDynamics::requireConstraintsForMonitors() const {
 
 // ---------------------------------------------------------------------------------------------- the on-step state
 
-void VRattleDynamics::factorizeAt(const vector<Vec3>& positions) {
-    isFactorCurrent = false;
-    system.evaluateJacobian(positions, jacobianNext);
-    matrix.factorize(jacobianNext);
-}
-
-// After a step that was not completed the factor may belong to its end.
-void VRattleDynamics::restoreFactor() {
-    if (isFactorCurrent)
+// G(q), G M^-1 F and the factor of K, of the general clusters or of all. The batches form their own in each pass.
+void VRattleDynamics::ensureFactor(FactorScope scope) {
+    if (!isMonitorCurrent) {
+        monitor.setForces(force, groupEnergy);
+        isMonitorCurrent = true;
+    }
+    if (factorScope >= scope)
         return;
-    factorizeAt(q);
-    jacobian.swap(jacobianNext);
-    isFactorCurrent = true;
-    monitor.setForces(force, groupEnergy);
-    system.multiplyOverMass(jacobian, force, appliedTerm);
+    const int first = scope == FullFactor ? 0 : system.getFirstGeneral();
+    system.evaluateJacobian(q, jacobian, first);
+    matrix.factorize(jacobian, first);
+    system.multiplyOverMass(jacobian, force, appliedTerm, first);
+    factorScope = scope;
 }
 
-// Lambda = K^-1 (g''(v,v) + G M^-1 F)   (4.3)
-void VRattleDynamics::computeMultipliers(const vector<Vec3>& velocities, vector<double>& result) const {
-    system.evaluateCurvature(velocities, result);
-    for (size_t k = 0; k < result.size(); k++)
-        result[k] += appliedTerm[k];
-    matrix.solve(result);
+// v - M^-1 G^T K^-1 G v
+void VRattleDynamics::projectVelocities(vector<Vec3>& velocities) {
+    ensureFactor(FullFactor);
+    system.multiply(jacobian, velocities, correction);
+    matrix.solve(correction);
+    system.addTransposedOverMass(jacobian, correction, -1.0, velocities);
 }
 
-// v - M^-1 G^T K^-1 G v, with the G to which the factor belongs (jacobianNext before it is taken over).
-void VRattleDynamics::projectVelocities(vector<Vec3>& velocities) const {
-    const ConstraintSystem::Jacobian& g = isFactorCurrent ? jacobian : jacobianNext;
-    vector<double>& x = const_cast<vector<double>&>(correction);
-    system.multiply(g, velocities, x);
-    matrix.solve(x);
-    system.addTransposedOverMass(g, x, -1.0, velocities);
-}
-
+// u(q,p) with Lambda = K^-1 (g''(v,v) + G M^-1 F)   (4.3)
 double VRattleDynamics::evaluateU(const vector<Vec3>& velocities) {
-    if (monitor.needsMultipliers())
-        computeMultipliers(velocities, multiplierTrial);
-    monitor.evaluate(velocities, multiplierTrial, jacobian, valuesNext);
-    return combineAndLimit(valuesNext);
+    ensureFactor(FullFactor);
+    if (monitor.needsMultipliers()) {
+        system.evaluateCurvature(velocities, rightSideTrial);
+        for (size_t k = 0; k < rightSideTrial.size(); k++)
+            rightSideTrial[k] += appliedTerm[k];
+        multiplierTrial = rightSideTrial;
+        matrix.solve(multiplierTrial);
+    }
+    monitor.evaluate(velocities, multiplierTrial, rightSideTrial, valuesTrial);
+    return combineAndLimit(valuesTrial);
 }
 
 // The on-step quantities at a position: (3.12)-(3.13) from the half-step velocities, then Lambda and the monitors.
 void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector<Vec3>& halfStep,
                                      const vector<Vec3>& forces, double energy, double kick, vector<Vec3>& velocities,
-                                     vector<double>& multipliers, vector<double>& monitorValues) {
-    factorizeAt(positions);
+                                     vector<double>& multipliers, vector<double>& rightSides,
+                                     vector<double>& monitorValues, bool withHalfStep) {
+    factorScope = NoFactor;
+    isMonitorCurrent = false;
+    const OnStepArrays arrays = {positions.data(),     halfStep.data(),
+                                 forces.data(),        velocities.data(),
+                                 multipliers.data(),   rightSides.data(),
+                                 withHalfStep ? lambdaHalf.data() : nullptr, rightSideHalf.data(),
+                                 lambdaRate.data(),    kick};
+    double pivot = std::numeric_limits<double>::infinity();
+    for (const auto& batch : system.getBatches()) {
+        const double smallest = batch->finish(arrays, 0, batch->getSize());
+        if (smallest < pivot || std::isnan(smallest))
+            pivot = smallest;
+    }
+    if (!(pivot > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
+        // The general way knows how to name the cluster.
+        system.evaluateJacobian(positions, jacobianNext);
+        matrix.factorize(jacobianNext);
+    }
+    evaluateOnStepGeneral(arrays, positions, halfStep, forces, velocities, multipliers, rightSides);
     const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i = 0; i < system.getNumParticles(); i++)
+    for (int i : system.getFreeParticles())
         velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]);
-    projectVelocities(velocities);
-    system.multiplyOverMass(jacobianNext, forces, appliedTerm);
-    computeMultipliers(velocities, multipliers);
     monitor.setForces(forces, energy);
-    monitor.evaluate(velocities, multipliers, jacobianNext, monitorValues);
+    monitor.evaluate(velocities, multipliers, rightSides, monitorValues);
     monitor.requireValid(monitorValues);
+    if (withHalfStep)
+        monitor.evaluate(halfStep, lambdaHalf, rightSideHalf, valuesHalf);
+}
+
+void VRattleDynamics::evaluateOnStepGeneral(const OnStepArrays& arrays, const vector<Vec3>& positions,
+                                            const vector<Vec3>& halfStep, const vector<Vec3>& forces,
+                                            vector<Vec3>& velocities, vector<double>& multipliers,
+                                            vector<double>& rightSides) {
+    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
+    if (first == end)
+        return;
+    system.evaluateJacobian(positions, jacobianNext, first);
+    matrix.factorize(jacobianNext, first);
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    for (int i : system.getGeneralParticles())
+        velocities[i] = halfStep[i] + forces[i] * (arrays.kick * inverseMasses[i]);
+    system.multiply(jacobianNext, velocities, correction, first);
+    matrix.solve(correction, first);
+    system.addTransposedOverMass(jacobianNext, correction, -1.0, velocities, first);
+    system.multiplyOverMass(jacobianNext, forces, appliedTermNext, first);
+    auto computeMultipliers = [&](const vector<Vec3>& at, vector<double>& right, vector<double>& result) {
+        system.evaluateCurvature(at, right, first);
+        for (int k = first; k < end; k++)
+            result[k] = right[k] += appliedTermNext[k];
+        matrix.solve(result, first);
+    };
+    computeMultipliers(velocities, rightSides, multipliers);
+    if (arrays.lambdaHalf == nullptr)
+        return;
+    computeMultipliers(halfStep, rightSideHalf, lambdaHalf);
+    // Along dv = M^-1 (F - G^T Lambda), dLambda = 2 K^-1 G(v) dv.
+    for (int i : system.getGeneralParticles())
+        acceleration[i] = forces[i] * inverseMasses[i];
+    system.addTransposedOverMass(jacobianNext, multipliers, -1.0, acceleration, first);
+    system.evaluateJacobian(velocities, velocityJacobian, first);
+    system.multiply(velocityJacobian, acceleration, lambdaRate, first);
+    for (int k = first; k < end; k++)
+        lambdaRate[k] *= 2;
+    matrix.solve(lambdaRate, first);
+}
+
+// The change of u along F - G^T Lambda, of the on-step state that is about to be taken over.
+double VRattleDynamics::evaluateRate() {
+    if (monitor.usesVelocities()) {
+        const vector<double>& inverseMasses = system.getInverseMasses();
+        for (int i : movingParticles)
+            acceleration[i] = monitor.getForces()[i] * inverseMasses[i];
+        system.evaluateJacobian(qNext, velocityJacobian);
+        system.addTransposedOverMass(velocityJacobian, lambdaNext, -1.0, acceleration);
+    }
+    return density.limitDerivative(monitor.combine(valuesNext)) *
+           monitor.evaluateRate(vNext, lambdaNext, rightSideNext, valuesNext, acceleration, lambdaRate);
 }
 
 bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
     if (system.getNumConstraints() == 0 || system.evaluate(positions, residual) <= settings.tolerance)
         return false;
     // Newton's iteration for g(q + M^-1 G(q)^T x) = 0 with the chord matrix K(q), then with the full one.
-    factorizeAt(positions);
+    factorScope = NoFactor;
+    system.evaluateJacobian(positions, jacobianNext);
+    matrix.factorize(jacobianNext);
     qNext = positions;
     bool isNewton = false;
     double previous = std::numeric_limits<double>::infinity();
-    for (int iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
+    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         lastError = system.evaluate(qNext, residual);
         if (!std::isfinite(lastError))
             break;
@@ -224,18 +300,18 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     v = velocities;
     force = forces;
     groupEnergy = energy;
+    // Particles without mass stay as they are, in whatever array is written.
+    qNext = qBack = positions;
+    w = wNext = wBack = vNext = vBack = velocities;
     forgetDensity();
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
-    isFactorCurrent = false;
-    restoreFactor();
-    projectVelocities(v);
-    computeMultipliers(v, lambda);
-    monitor.evaluate(v, lambda, jacobian, values);
-    monitor.requireValid(values);
+    evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+    isMonitorCurrent = true;
 }
 
 VRattleDynamics::Memory VRattleDynamics::getMemory() const {
-    Memory memory = {hasDensity, rho, w, multiplierOffset, {}};
+    Memory memory = {hasDensity, rho,    w, multiplierOffset, {}, lambda, values, hasHalfStepValue,
+                     u,          halfStepValue, rate};
     for (const StepMonitor::Term& term : monitor.getTerms())
         memory.references.push_back(term.reference);
     return memory;
@@ -245,17 +321,18 @@ void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& 
                              double energy, const Memory& memory) {
     begin(positions, velocities, forces, energy);
     v = velocities; // begin() has projected them, which changes the last bits
-    computeMultipliers(v, lambda);
-    monitor.evaluate(v, lambda, jacobian, values);
+    lambda = memory.multipliers;
+    values = memory.monitorValues;
     for (size_t k = 0; k < memory.references.size(); k++)
         monitor.setReference((int) k, memory.references[k]);
-    if (!memory.hasDensity)
-        return;
-    hasDensity = true;
+    hasDensity = memory.hasDensity;
     rho = memory.density;
     w = memory.halfStepVelocities;
     multiplierOffset = memory.multiplierOffset;
-    u = combineAndLimit(values);
+    hasHalfStepValue = memory.hasHalfStepValue;
+    u = memory.u;
+    halfStepValue = memory.halfStepValue;
+    rate = memory.rate;
 }
 
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
@@ -273,54 +350,42 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
 }
 
 void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
-    restoreFactor();
     vector<Vec3>& change = vNext;
-    for (int i = 0; i < system.getNumParticles(); i++)
+    for (int i : movingParticles)
         change[i] = velocities[i] - v[i];
     projectVelocities(change);
-    for (int i = 0; i < system.getNumParticles(); i++) {
+    for (int i : movingParticles) {
         v[i] += change[i];
         w[i] += change[i];
     }
-    computeMultipliers(v, lambda);
-    monitor.evaluate(v, lambda, jacobian, values);
+    evaluateU(v);
+    lambda = multiplierTrial;
+    rightSide = rightSideTrial;
+    values = valuesTrial;
+    hasHalfStepValue = false;
     rescaleDensity(u);
 }
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (METHOD section 7)
 void VRattleDynamics::formHalfStepVelocities() {
+    ensureFactor(FullFactor);
     const double kick = 0.5 * settings.stepSize / rho;
     const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i = 0; i < system.getNumParticles(); i++)
+    for (int i : movingParticles)
         w[i] = v[i] - force[i] * (kick * inverseMasses[i]);
     system.addTransposedOverMass(jacobian, lambda, kick, w);
+    hasHalfStepValue = false;
 }
 
 // ------------------------------------------------------------------------------------------ the equations of a step
 
-// acceleration = M^-1 (F - G^T lambda), w+ = start + kick acceleration (3.10), q+ = q + drift w+ (3.9)
-void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift) {
-    const vector<double>& inverseMasses = system.getInverseMasses();
-    const int numParticles = system.getNumParticles();
-    for (int i = 0; i < numParticles; i++)
-        acceleration[i] = force[i] * inverseMasses[i];
-    system.addTransposedOverMass(jacobian, lambdaNext, -1.0, acceleration);
-    for (int i = 0; i < numParticles; i++) {
-        if (inverseMasses[i] > 0) {
-            wNext[i] = start[i] + acceleration[i] * kick;
-            qNext[i] = q[i] + wNext[i] * drift;
-        }
-        else {
-            wNext[i] = start[i];
-            qNext[i] = q[i];
-        }
-    }
-}
-
-// Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes that O(h^3).
-void VRattleDynamics::addMultiplierOffset() {
-    for (size_t k = 0; k < lambdaNext.size(); k++)
-        lambdaNext[k] += multiplierOffset[k];
+// Where the iteration starts. Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes
+// that O(h^3).
+void VRattleDynamics::startMultipliers(bool withOffset) {
+    lambdaNext = lambda;
+    if (withOffset)
+        for (size_t k = 0; k < lambdaNext.size(); k++)
+            lambdaNext[k] += multiplierOffset[k];
 }
 
 void VRattleDynamics::keepMultiplierOffset() {
@@ -328,35 +393,96 @@ void VRattleDynamics::keepMultiplierOffset() {
         multiplierOffset[k] = lambdaNext[k] - lambda[k];
 }
 
-// Newton's iteration on lambda for g(q+) = 0 (3.11), with A = -kick drift K(q), or G(q+) M^-1 G(q)^T in place of K.
+StepArrays VRattleDynamics::stepArrays(const vector<Vec3>& start, double kick, double drift) {
+    return {q.data(),          start.data(),      force.data(),           qNext.data(),          wNext.data(),
+            lambdaNext.data(), correction.data(), multiplierTrial.data(), rightSideTrial.data(), kick,
+            drift};
+}
+
+// acceleration = M^-1 (F - G^T lambda), w+ = start + kick acceleration (3.10), q+ = q + drift w+ (3.9)
+void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift, const vector<int>& particles,
+                                   int first) {
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    for (int i : particles)
+        acceleration[i] = force[i] * inverseMasses[i];
+    system.addTransposedOverMass(jacobian, lambdaNext, -1.0, acceleration, first);
+    for (int i : particles) {
+        wNext[i] = start[i] + acceleration[i] * kick;
+        qNext[i] = q[i] + wNext[i] * drift;
+    }
+}
+
+void VRattleDynamics::moveFreeParticles(const vector<Vec3>& start, double kick, double drift) {
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    for (int i : system.getFreeParticles()) {
+        wNext[i] = start[i] + force[i] * (kick * inverseMasses[i]);
+        qNext[i] = q[i] + wNext[i] * drift;
+    }
+}
+
+// Solve g(q+) = 0 (3.11) for lambda, with given kick and drift, by chord iterations with A = -kick drift K(q).
 bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift, double margin) {
-    lambdaNext = lambda;
-    if (margin == REGULAR_MARGIN)
-        addMultiplierOffset();
-    bool isNewton = false;
+    startMultipliers(margin == REGULAR_MARGIN);
+    moveFreeParticles(start, kick, drift);
+    const StepArrays arrays = stepArrays(start, kick, drift);
+    const double tolerance = margin * settings.tolerance;
+    int iterations = 0;
+    lastError = 0;
+    auto keepLargest = [&](double error) {
+        if (error > lastError || std::isnan(error))
+            lastError = error;
+    };
+    for (const auto& batch : system.getBatches())
+        keepLargest(batch->solvePositions(arrays, 0, batch->getSize(), tolerance, iterations));
+    keepLargest(solveGeneral(start, kick, drift, tolerance, iterations));
+    numIterations += iterations;
+    return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
+}
+
+// The same for the clusters that are in no batch; returns the largest |g| left.
+double VRattleDynamics::solveGeneral(const vector<Vec3>& start, double kick, double drift, double tolerance,
+                                     int& iterations) {
+    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
+    if (first == end)
+        return 0;
+    ensureFactor(GeneralFactor);
     double previous = std::numeric_limits<double>::infinity();
-    for (int iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
-        computeTrial(start, kick, drift);
-        if (system.getNumConstraints() == 0)
-            return true;
+    for (int iteration = 0;; iteration++) {
+        computeTrial(start, kick, drift, system.getGeneralParticles(), first);
+        const double error = system.evaluate(qNext, residual, first);
+        // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance. Where the error
+        // is no longer reduced it is rounding, or Newton's to deal with.
+        if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous) || iteration == MAX_CHORD_ITERATIONS)) {
+            iterations = std::max(iterations, iteration);
+            return error;
+        }
+        previous = error;
+        std::copy(residual.begin() + first, residual.end(), correction.begin() + first);
+        matrix.solve(correction, first);
+        for (int k = first; k < end; k++)
+            lambdaNext[k] += correction[k] / (kick * drift);
+    }
+}
+
+// The same for all constraints with Newton's iteration: G(q+) M^-1 G(q)^T in place of K. Where the chord iteration fails.
+bool VRattleDynamics::solvePositionsByNewton(const vector<Vec3>& start, double kick, double drift) {
+    ensureFactor(FullFactor);
+    startMultipliers(false);
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
+        computeTrial(start, kick, drift, movingParticles, 0);
         lastError = system.evaluate(qNext, residual);
         if (!std::isfinite(lastError))
             return false;
         const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
-        // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance.
-        if (iteration > 0 && lastError <= settings.tolerance * (isSlow ? 1.0 : margin))
+        if (iteration > 0 && lastError <= settings.tolerance * (isSlow ? 1.0 : REGULAR_MARGIN))
             return true;
-        isNewton = isNewton || isSlow;
         previous = lastError;
         correction = residual;
-        if (isNewton) {
-            system.evaluateJacobian(qNext, jacobianNext);
-            if (!newtonMatrix.factorize(jacobianNext, jacobian))
-                return false;
-            newtonMatrix.solve(correction);
-        }
-        else
-            matrix.solve(correction);
+        system.evaluateJacobian(qNext, jacobianNext);
+        if (!newtonMatrix.factorize(jacobianNext, jacobian))
+            return false;
+        newtonMatrix.solve(correction);
         for (size_t k = 0; k < lambdaNext.size(); k++)
             lambdaNext[k] += correction[k] / (kick * drift);
         numIterations++;
@@ -364,70 +490,123 @@ bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, dou
     return false;
 }
 
-// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (METHOD section 8).
+/*
+ * Solve (3.11) and (3.14) for lambda and rho+ together. In each pass lambda gets its chord update and rho+ that of
+ * Newton's iteration on F = rho+ + rho - u(q,p+) - u(q,p-), whose derivative is 1 + (h/(2 rho+^2)) du/dp (F - G^T Lambda)
+ * along the constraints; what either update does to the other's equation is of higher order in h and left to the next pass.
+ */
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     const double h = settings.stepSize;
+    if (!hasHalfStepValue) {
+        halfStepValue = evaluateU(w);
+        hasHalfStepValue = true;
+    }
+    if (system.getFirstGeneral() < system.getNumConstraints())
+        ensureFactor(GeneralFactor);
+    rhoNext = StepDensity::sumUpdate(u, rho);
+    if (!(rhoNext > 0))
+        return TooSlow;
+    startMultipliers(true);
+    std::fill(correction.begin(), correction.end(), 0.0);
+    double previous = std::numeric_limits<double>::infinity();
+    const double densityTolerance = std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING);
+    for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
+        const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
+        const StepArrays arrays = stepArrays(w, kick, drift);
+        lastError = 0;
+        auto keepLargest = [&](double error) {
+            if (error > lastError || std::isnan(error))
+                lastError = error;
+        };
+        for (const auto& batch : system.getBatches())
+            keepLargest(batch->coupledPass(arrays, 0, batch->getSize()));
+        keepLargest(coupledPassGeneral(kick, drift));
+        moveFreeParticles(w, kick, drift);
+        monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
+        const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;
+        const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
+                                      std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
+        if (pass > 0 && error <= 1)
+            return Converged;
+        if (!std::isfinite(error) || error > SLOW_COUPLED_CONVERGENCE * previous)
+            return TooSlow;
+        previous = error;
+        rhoNext -= mismatch / (1 + 0.5 * h * rate / (rhoNext * rhoNext));
+        if (!(rhoNext > 0))
+            return TooSlow;
+        numIterations++;
+    }
+    return TooSlow;
+}
+
+// One pass of the coupled iteration for the clusters that are in no batch; see ClusterBatch::coupledPass().
+double VRattleDynamics::coupledPassGeneral(double kick, double drift) {
+    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
+    if (first == end)
+        return 0;
+    for (int k = first; k < end; k++)
+        lambdaNext[k] += correction[k];
+    computeTrial(w, kick, drift, system.getGeneralParticles(), first);
+    const double error = system.evaluate(qNext, residual, first);
+    system.evaluateCurvature(wNext, rightSideTrial, first);
+    for (int k = first; k < end; k++) {
+        multiplierTrial[k] = rightSideTrial[k] += appliedTerm[k];
+        correction[k] = residual[k] / (kick * drift);
+    }
+    matrix.solve(multiplierTrial, first);
+    matrix.solve(correction, first);
+    return error;
+}
+
+// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (METHOD section 8), for all
+// constraints. Where the coupled chord iteration fails.
+VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
+    ensureFactor(FullFactor);
+    const double h = settings.stepSize;
     const double uMinus = evaluateU(w);
-    lambdaNext = lambda;
-    addMultiplierOffset();
+    startMultipliers(true);
     rhoNext = StepDensity::sumUpdate(u, rho);
     if (!(rhoNext > 0))
         rhoNext = density.boundedUpdate(u, rho);
-    bool isNewton = false;
     int numCuts = 0;
-    double previous = std::numeric_limits<double>::infinity(), d = 0;
-    for (int iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
-        computeTrial(w, kick, drift);
+        computeTrial(w, kick, drift, movingParticles, 0);
         lastError = system.evaluate(qNext, residual);
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F of METHOD section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
-        const double error =
-            std::max(lastError / (REGULAR_MARGIN * settings.tolerance), relativeMismatch / DENSITY_TOLERANCE);
+        const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
+                                      relativeMismatch / std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING));
         if (!std::isfinite(error))
             return NotConverged;
         const bool isSlow = error > SLOW_CONVERGENCE * previous;
-        const bool isGoodEnough = lastError <= settings.tolerance && relativeMismatch <= DENSITY_ROUNDING;
-        if (iteration > 0 && (error <= 1 || (isNewton && isSlow && isGoodEnough)))
+        const bool isGoodEnough = lastError <= settings.tolerance && relativeMismatch <= STRAINED_DENSITY_ROUNDING;
+        if (iteration > 0 && (error <= 1 || (isSlow && isGoodEnough)))
             return Converged;
-        isNewton = isNewton || isSlow;
         previous = error;
-        if (isNewton) {
-            system.evaluateJacobian(qNext, jacobianNext);
-            if (!newtonMatrix.factorize(jacobianNext, jacobian))
-                return NotConverged;
+        system.evaluateJacobian(qNext, jacobianNext);
+        if (!newtonMatrix.factorize(jacobianNext, jacobian))
+            return NotConverged;
+        // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
+        monitor.evaluateGradient(wNext, multiplierTrial, valuesTrial, matrix, gradient);
+        const double derivative = density.limitDerivative(monitor.combine(valuesTrial));
+        system.multiplyOverMass(jacobian, gradient, coupling);
+        for (double& a : coupling)
+            a *= kick * derivative;
+        double d = 1;
+        const double kickChange = -0.5 * h / (rhoNext * rhoNext); // d(kick)/d(rho+)
+        for (int i : movingParticles) {
+            d -= derivative * kickChange * gradient[i].dot(acceleration[i]);
+            halfStepChange[i] = acceleration[i] * (drift * kickChange) - wNext[i] * (drift / rhoNext);
         }
-        if (isNewton || iteration == 0) {
-            // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-            monitor.evaluateGradient(wNext, multiplierTrial, valuesNext, matrix, gradient);
-            const double derivative = density.limitDerivative(monitor.combine(valuesNext));
-            system.multiplyOverMass(jacobian, gradient, coupling);
-            for (double& a : coupling)
-                a *= kick * derivative;
-            d = 1;
-            const double kickChange = -0.5 * h / (rhoNext * rhoNext); // d(kick)/d(rho+)
-            for (int i = 0; i < system.getNumParticles(); i++) {
-                d -= derivative * kickChange * gradient[i].dot(acceleration[i]);
-                halfStepChange[i] = system.getInverseMasses()[i] == 0
-                                        ? Vec3()
-                                        : acceleration[i] * (drift * kickChange) - wNext[i] * (drift / rhoNext);
-            }
-            if (!isNewton)
-                system.evaluateJacobian(qNext, jacobianNext);
-            system.multiply(jacobianNext, halfStepChange, response);
-            if (isNewton)
-                newtonMatrix.solve(response);
-            else
-                matrix.solve(response);
-            for (double& x : response)
-                x /= -kick * drift;
-        }
+        system.multiply(jacobianNext, halfStepChange, response);
+        newtonMatrix.solve(response);
+        for (double& x : response)
+            x /= -kick * drift;
         correction = residual; // x1 = -A^-1 g
-        if (isNewton)
-            newtonMatrix.solve(correction);
-        else
-            matrix.solve(correction);
+        newtonMatrix.solve(correction);
         for (double& x : correction)
             x /= kick * drift;
         double change = (-mismatch - dot(coupling, correction)) / (d - dot(coupling, response));
@@ -448,14 +627,13 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
 
 // Solve for rho+, lambda, w+ and q+ of a regular step; returns its size.
 double VRattleDynamics::solveRegular() {
-    restoreFactor();
     bool isRescue = false;
     if (settings.isFixedStep || monitor.isEmpty())
         rhoNext = 1;
     else if (settings.update == StepDensity::Bounded)
         rhoNext = density.boundedUpdate(u, rho);
-    else if (settings.update == StepDensity::SemiExplicit && monitor.dependsOnVelocities()) {
-        if (solveCoupled() == Converged)
+    else if (needsHalfStepValue()) {
+        if (solveCoupled() == Converged || solveCoupledByNewton() == Converged)
             return settings.stepSize / rhoNext;
         isRescue = true;
     }
@@ -513,7 +691,6 @@ double VRattleDynamics::step(double maxStep) {
     stepNext = isShortened ? maxStep : full;
     if (stepKind == First || isShortened) {
         // A step of plain RATTLE from the on-step state.
-        restoreFactor();
         if (isShortened)
             stepKind = Shortened;
         if (!solvePositions(v, 0.5 * stepNext, stepNext, ON_STEP_MARGIN))
@@ -528,16 +705,20 @@ double VRattleDynamics::step(double maxStep) {
 bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     if (!isFinite(forces))
         throw StepFailure("the force on a particle became infinite or not a number at the end of the step");
+    const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
+    vector<double> backValues;
+    const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
     if (stepKind == Regular)
         keepMultiplierOffset();
-    vector<double> backValues;
-    bool hasBack = false;
-    const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
-    if (isStart)
-        hasBack = evaluateBackwards(forces, energy, backValues);
-    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaNext, valuesNext);
+    const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
+    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaNext, rightSideNext, valuesNext, withHalfStep);
     if (isStart && !startDensityFrom(backValues, hasBack))
         return false;
+    hasHalfStepValue = withHalfStep;
+    if (withHalfStep) {
+        halfStepValue = combineAndLimit(valuesHalf);
+        rate = evaluateRate();
+    }
 
     q.swap(qNext);
     v.swap(vNext);
@@ -545,10 +726,13 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     force = forces;
     groupEnergy = energy;
     lambda.swap(lambdaNext);
+    rightSide.swap(rightSideNext);
     values.swap(valuesNext);
     jacobian.swap(jacobianNext);
-    isFactorCurrent = true;
+    appliedTerm.swap(appliedTermNext);
+    factorScope = GeneralFactor;
     monitor.forcesMoved(force);
+    isMonitorCurrent = true;
     if (stepKind == First) {
         hasDensity = true;
         firstDensity = 0;
@@ -568,12 +752,14 @@ void VRattleDynamics::reverse() {
         solveRegular();
         keepMultiplierOffset();
         numRescues = rescuesBefore;
-        for (int i = 0; i < system.getNumParticles(); i++)
+        for (int i : movingParticles)
             w[i] = -wNext[i];
         rho = rhoNext;
+        rate = -rate;
+        hasHalfStepValue = false;
     }
-    for (Vec3& velocity : v)
-        velocity = -velocity;
+    for (int i : movingParticles)
+        v[i] = -v[i];
 }
 
 // ------------------------------------------------------------------------------------------------------- the start
@@ -608,7 +794,7 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
         forceBack[i] = force[i] + (forces[i] - force[i]) * alpha;
     try {
         evaluateOnStep(qBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext, vBack,
-                       lambdaBack, backValues);
+                       lambdaBack, rightSideBack, backValues, false);
     }
     catch (const StepFailure&) {
         return false; // no state to look back at

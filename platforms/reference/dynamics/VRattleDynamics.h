@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 #define OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 
+#include "ClusterBatch.h"
 #include "ConstraintMatrix.h"
 #include "ConstraintSystem.h"
 #include "NewtonMatrix.h"
@@ -41,13 +42,17 @@ public:
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
     };
 
-    /** What the next step depends on beside the settings and the state at its start; saved for a restart. */
+    /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
     struct Memory {
         bool hasDensity;
-        double density;                             // rho[n-1/2]
+        double density;                               // rho[n-1/2]
         std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
-        std::vector<double> multiplierOffset;       // lambda[n-1] - Lambda[n-1], in internal order
-        std::vector<double> references;             // U_k,ref in force
+        std::vector<double> multiplierOffset;         // lambda[n-1] - Lambda[n-1], in internal order
+        std::vector<double> references;               // U_k,ref in force
+        // What could be computed again but for the last bits, which decide whether a restart is exact:
+        std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
+        bool hasHalfStepValue;
+        double u, halfStepValue, rate; // u(q[n],p[n]), u(q[n],p[n-1/2]), and the change of u along F - G^T Lambda
     };
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
@@ -158,28 +163,44 @@ public:
 
 private:
     enum StepKind { Regular, First, Shortened };
-    enum SolveResult { Converged, NotConverged, NotPositive };
+    enum SolveResult { Converged, TooSlow, NotConverged, NotPositive };
+    enum FactorScope { NoFactor, GeneralFactor, FullFactor };
     void requireConstraintsForMonitors() const;
-    void factorizeAt(const std::vector<OpenMM::Vec3>& positions);
-    void restoreFactor();
     void forgetDensity();
     void rescaleDensity(double oldU);
     double combineAndLimit(const std::vector<double>& monitorValues) const;
+    bool needsHalfStepValue() const;
+
+    void ensureFactor(FactorScope scope);
     void formHalfStepVelocities();
-    void computeMultipliers(const std::vector<OpenMM::Vec3>& velocities, std::vector<double>& result) const;
     double evaluateU(const std::vector<OpenMM::Vec3>& velocities);
-    void projectVelocities(std::vector<OpenMM::Vec3>& velocities) const;
+    void projectVelocities(std::vector<OpenMM::Vec3>& velocities);
     void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
                         const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
                         std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
-                        std::vector<double>& monitorValues);
-    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+                        std::vector<double>& rightSides, std::vector<double>& monitorValues, bool withHalfStep);
+    void evaluateOnStepGeneral(const OnStepArrays& arrays, const std::vector<OpenMM::Vec3>& positions,
+                               const std::vector<OpenMM::Vec3>& halfStep, const std::vector<OpenMM::Vec3>& forces,
+                               std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
+                               std::vector<double>& rightSides);
+    double evaluateRate();
+
+    StepArrays stepArrays(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    void startMultipliers(bool withOffset);
+    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift,
+                      const std::vector<int>& particles, int first);
+    void moveFreeParticles(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double margin);
-    void addMultiplierOffset();
-    void keepMultiplierOffset();
+    double solveGeneral(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double tolerance,
+                        int& iterations);
+    bool solvePositionsByNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     SolveResult solveCoupled();
+    double coupledPassGeneral(double kick, double drift);
+    SolveResult solveCoupledByNewton();
     double solveRegular();
+    void keepMultiplierOffset();
     [[noreturn]] void throwNotConverged() const;
+
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
     bool startDensityFrom(const std::vector<double>& backValues, bool hasBack);
     static double startValue(double start, double ahead, const double* back);
@@ -190,26 +211,35 @@ private:
     StepMonitor monitor;
     StepDensity density;
     Settings settings;
+    std::vector<int> movingParticles;
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
     double groupEnergy, rho, u;
-    std::vector<double> lambda, values, appliedTerm; // appliedTerm: G M^-1 F
-    std::vector<double> multiplierOffset;            // lambda[n-1] - Lambda[n-1]
-    ConstraintSystem::Jacobian jacobian;             // G(q[n]), to which the factor of the matrix belongs
-    bool hasDensity, isFactorCurrent;
-    double firstDensity; // of the first step, once it is known; else 0
+    std::vector<double> lambda, rightSide, values; // Lambda, K Lambda and U_k
+    std::vector<double> multiplierOffset;          // lambda[n-1] - Lambda[n-1]
+    bool hasDensity, hasHalfStepValue;
+    double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
+    double firstDensity;        // of the first step, once it is known; else 0
+
+    // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
+    FactorScope factorScope;
+    bool isMonitorCurrent; // whether the monitor has the forces at q[n]
+    ConstraintSystem::Jacobian jacobian;
+    std::vector<double> appliedTerm;
 
     // The step in progress.
     StepKind stepKind;
-    std::vector<OpenMM::Vec3> qNext, wNext, vNext, forceNext, acceleration, gradient, halfStepChange;
-    double rhoNext, stepNext, kickNext;
-    std::vector<double> lambdaNext, valuesNext, multiplierTrial, residual, correction, coupling, response;
-    ConstraintSystem::Jacobian jacobianNext;
+    std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
+    double rhoNext, stepNext, kickNext, halfStepValueNext, rateNext;
+    std::vector<double> lambdaNext, rightSideNext, valuesNext, appliedTermNext;
+    std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
+    std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
+    ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
 
     // Work space of the start.
     std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
-    std::vector<double> lambdaBack;
+    std::vector<double> lambdaBack, rightSideBack;
 
     long long numIterations, numRescues;
     double lastError; // the largest relative error of a constraint that the last iteration left

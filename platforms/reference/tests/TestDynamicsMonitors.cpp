@@ -51,9 +51,21 @@ public:
         system.evaluateCurvature(v, multipliers);
         for (size_t k = 0; k < multipliers.size(); k++)
             multipliers[k] += applied[k];
+        rightSide = multipliers;
         matrix.solve(multipliers);
-        monitor.evaluate(v, multipliers, jacobian, values);
+        monitor.evaluate(v, multipliers, rightSide, values);
         return monitor.combine(values);
+    }
+    // du along a change of v, with the change of Lambda that goes with it: 2 K^-1 G(v) dv
+    double rate(const vector<Vec3>& v, const vector<Vec3>& change) {
+        u(v);
+        vector<double> multiplierRate(multipliers.size());
+        system.evaluateJacobian(v, jacobian);
+        system.multiply(jacobian, change, multiplierRate);
+        for (double& x : multiplierRate)
+            x *= 2;
+        matrix.solve(multiplierRate);
+        return monitor.evaluateRate(v, multipliers, rightSide, values, change, multiplierRate);
     }
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
@@ -66,7 +78,7 @@ public:
     ConstraintMatrix matrix;
     StepMonitor monitor;
     ConstraintSystem::Jacobian jacobian;
-    vector<double> applied, multipliers, values;
+    vector<double> applied, multipliers, rightSide, values;
 };
 
 static void checkGradient(const vector<StepMonitor::Term>& terms, double order) {
@@ -86,6 +98,11 @@ static void checkGradient(const vector<StepMonitor::Term>& terms, double order) 
             double difference = (evaluation.u(plus) - evaluation.u(minus)) / (2 * h);
             ASSERT(std::fabs(difference - gradient[i][j]) <= 1e-6 * largest);
         }
+    // The rate along a direction is the gradient times it.
+    double expected = 0;
+    for (size_t i = 0; i < gradient.size(); i++)
+        expected += gradient[i].dot(e.forces[i]);
+    ASSERT(std::fabs(evaluation.rate(e.velocities, e.forces) - expected) <= 1e-10 * (std::fabs(expected) + largest));
 }
 
 void testGradients() {
