@@ -459,11 +459,13 @@ def draw_trajectory_and_error(study: Study) -> Figure:
     rods = np.concatenate([np.zeros((1, 2)), paths[0]])
     left.plot(rods[:, 0], rods[:, 1], color="black", linewidth=1.4, linestyle=(0, (2, 1.5)), label="rods at the start")
     left.plot(0, 0, "o", color="black", markersize=5)
-    left.set_aspect("equal", adjustable="datalim")
+    left.set_aspect("equal")
+    left.set_xlim(-2.15, 2.15)
+    left.set_ylim(-2.15, 1.9)  # room for the legend
     left.set_xlabel("x (nm)")
     left.set_ylabel("y (nm)")
     left.set_title("(a) paths of the bobs", fontsize=11)
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, frameon=False, fontsize=8, columnspacing=1.0)
+    left.legend(loc="upper left", frameon=False, fontsize=8.5)
     trial = study.trials[U1.name]
     for name, run, style in (
         ("RATTLE", trial.fixed, {"linewidth": 2.6, "alpha": 0.55}),
