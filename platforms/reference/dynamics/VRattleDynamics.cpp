@@ -22,7 +22,7 @@ const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // The density equation (3.14) is solved to the tolerance of the constraints, but not closer than rounding of U allows; and
 // where strained, badly scaled constraints make that rounding larger, the second number counts.
-const double DENSITY_ROUNDING = 1e-13, STRAINED_DENSITY_ROUNDING = 1e-8;
+const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
 
@@ -44,7 +44,7 @@ bool isFinite(const vector<Vec3>& vectors) {
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
         system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), settings(), groupEnergy(0),
-        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), firstDensity(0),
+        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0),
         factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
         halfStepValueNext(0), rateNext(0), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
@@ -304,6 +304,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     qNext = qBack = positions;
     w = wNext = wBack = vNext = vBack = velocities;
     forgetDensity();
+    densityOffset = 0;
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
     evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
     isMonitorCurrent = true;
@@ -311,7 +312,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
 
 VRattleDynamics::Memory VRattleDynamics::getMemory() const {
     Memory memory = {hasDensity, rho,    w, multiplierOffset, {}, lambda, values, hasHalfStepValue,
-                     u,          halfStepValue, rate};
+                     u,          halfStepValue, rate, densityOffset};
     for (const StepMonitor::Term& term : monitor.getTerms())
         memory.references.push_back(term.reference);
     return memory;
@@ -333,6 +334,7 @@ void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& 
     u = memory.u;
     halfStepValue = memory.halfStepValue;
     rate = memory.rate;
+    densityOffset = memory.densityOffset;
 }
 
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
@@ -388,7 +390,8 @@ void VRattleDynamics::startMultipliers(bool withOffset) {
             lambdaNext[k] += multiplierOffset[k];
 }
 
-void VRattleDynamics::keepMultiplierOffset() {
+void VRattleDynamics::keepOffsets() {
+    densityOffset = rhoNext - StepDensity::sumUpdate(u, rho);
     for (size_t k = 0; k < lambdaNext.size(); k++)
         multiplierOffset[k] = lambdaNext[k] - lambda[k];
 }
@@ -503,7 +506,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     }
     if (system.getFirstGeneral() < system.getNumConstraints())
         ensureFactor(GeneralFactor);
-    rhoNext = StepDensity::sumUpdate(u, rho);
+    rhoNext = StepDensity::sumUpdate(u, rho) + densityOffset;
     if (!(rhoNext > 0))
         return TooSlow;
     startMultipliers(true);
@@ -709,7 +712,7 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     vector<double> backValues;
     const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
     if (stepKind == Regular)
-        keepMultiplierOffset();
+        keepOffsets();
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
     evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaNext, rightSideNext, valuesNext, withHalfStep);
     if (isStart && !startDensityFrom(backValues, hasBack))
@@ -750,7 +753,7 @@ void VRattleDynamics::reverse() {
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
         solveRegular();
-        keepMultiplierOffset();
+        keepOffsets();
         numRescues = rescuesBefore;
         for (int i : movingParticles)
             w[i] = -wNext[i];

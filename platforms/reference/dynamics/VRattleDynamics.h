@@ -52,7 +52,9 @@ public:
         // What could be computed again but for the last bits, which decide whether a restart is exact:
         std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
         bool hasHalfStepValue;
-        double u, halfStepValue, rate; // u(q[n],p[n]), u(q[n],p[n-1/2]), and the change of u along F - G^T Lambda
+        double u, halfStepValue; // u(q[n],p[n]), u(q[n],p[n-1/2])
+        double rate;             // the change of u along F - G^T Lambda
+        double densityOffset;    // what (3.14) and (3.15) differed by in the last step
     };
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
@@ -198,7 +200,7 @@ private:
     double coupledPassGeneral(double kick, double drift);
     SolveResult solveCoupledByNewton();
     double solveRegular();
-    void keepMultiplierOffset();
+    void keepOffsets();
     [[noreturn]] void throwNotConverged() const;
 
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
@@ -220,6 +222,7 @@ private:
     std::vector<double> multiplierOffset;          // lambda[n-1] - Lambda[n-1]
     bool hasDensity, hasHalfStepValue;
     double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
+    double densityOffset;       // what (3.14) and (3.15) differed by in the last step
     double firstDensity;        // of the first step, once it is known; else 0
 
     // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
