@@ -2,18 +2,27 @@
 // SPDX-License-Identifier: MIT
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "CheckpointBlock.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
 #include "openmm/internal/ContextImpl.h"
+#include "openmm/internal/ForceImpl.h"
+#include "openmm/serialization/SerializationNode.h"
+#include "openmm/serialization/XmlSerializer.h"
 #include "openmmvrattle/VRattleKernels.h"
+#include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <sstream>
 
 using namespace OpenMMVRattle;
 using OpenMM::ContextImpl;
 using OpenMM::OpenMMException;
 using OpenMM::Platform;
+using OpenMM::SerializationNode;
+using OpenMM::State;
+using OpenMM::XmlSerializer;
 using std::string;
 using std::vector;
 
@@ -23,6 +32,14 @@ namespace {
 const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
 const double DEFAULT_MAXIMUM_FACTOR = 2.0;
 const double USE_DEFAULT = -1.0;
+
+// Of the parameters that States hold; the settings among them have a version of their own.
+const int PARAMETERS_VERSION = 1;
+const char TYPE_NAME[] = "VariableStepRattleIntegrator";
+
+// The changes that Context::loadCheckpoint() announces after our loadCheckpoint(), in this order.
+const State::DataType CHANGES_AFTER_LOADING[] = {State::Positions, State::Velocities, State::Parameters, State::Energy};
+const int NUM_CHANGES_AFTER_LOADING = 4;
 
 void requirePositive(double value, const string& name) {
     if (!(value > 0) || !std::isfinite(value)) {
@@ -59,11 +76,24 @@ void checkOpenMMVersion() {
                               ".* or rebuild the plugin");
 }
 
+// A Drude particle moved like any other would take up heat from the rest. The class DrudeForce is in a library of its
+// own, which we do not link with, so it is recognised by its kernel.
+void refuseDrudeParticles(ContextImpl& context) {
+    for (OpenMM::ForceImpl* force : context.getForceImpls()) {
+        const vector<string> names = force->getKernelNames();
+        if (std::find(names.begin(), names.end(), "CalcDrudeForce") != names.end())
+            throw OpenMMException("VariableStepRattleIntegrator: the System has a DrudeForce and Drude particles need "
+                                  "an integrator made for them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
+                                  "DrudeLangevinIntegrator, or a force field without Drude particles");
+    }
+}
+
 } // namespace
 
 VariableStepRattleIntegrator::VariableStepRattleIntegrator(double stepSize) :
         nominalStepSize(0), lastStepSize(0), minimumStepSize(USE_DEFAULT), maximumStepSize(USE_DEFAULT),
-        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8) {
+        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8), reinitializationPhase(None),
+        numChangesAfterLoading(NUM_CHANGES_AFTER_LOADING) {
     monitors.push_back({ConstraintMultipliers, 1.0, 1.0, 0.0});
     setNominalStepSize(stepSize);
     setConstraintTolerance(1e-8);
@@ -87,6 +117,14 @@ double VariableStepRattleIntegrator::getStepSize() const {
 
 void VariableStepRattleIntegrator::setStepSize(double size) {
     setNominalStepSize(size);
+}
+
+bool VariableStepRattleIntegrator::hasMinimumStepSize() const {
+    return minimumStepSize >= 0;
+}
+
+bool VariableStepRattleIntegrator::hasMaximumStepSize() const {
+    return maximumStepSize >= 0;
 }
 
 double VariableStepRattleIntegrator::getMinimumStepSize() const {
@@ -178,7 +216,7 @@ double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
     if (context == NULL || monitors[index].reference > 0)
         return monitors[index].reference;
     OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
-    return stateful.getAs<IntegrateVRattleStepKernel>().getReferenceMonitorValue(*this, index);
+    return stateful.getAs<IntegrateVRattleStepKernel>().getReferenceMonitorValue(*context, *this, index);
 }
 
 void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
@@ -258,6 +296,7 @@ void VariableStepRattleIntegrator::stepTo(double time) {
 }
 
 double VariableStepRattleIntegrator::advance(double maxTime) {
+    reinitializationPhase = None;
     bool forcesInvalid = context->updateContextState();
     return kernel.getAs<IntegrateVRattleStepKernel>().execute(*context, *this, forcesInvalid, maxTime);
 }
@@ -271,6 +310,7 @@ void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
     checkOpenMMVersion();
     if (owner != NULL && &contextRef.getOwner() != owner)
         throw OpenMMException("This Integrator is already bound to a context");
+    refuseDrudeParticles(contextRef);
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
     created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef.getSystem(), *this);
     context = &contextRef;
@@ -281,13 +321,23 @@ void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
 
 void VariableStepRattleIntegrator::cleanup() {
     kernel = OpenMM::Kernel();
+    if (reinitializationPhase == CheckpointWritten)
+        reinitializationPhase = CleanedUp;
 }
 
 vector<string> VariableStepRattleIntegrator::getKernelNames() {
     return {IntegrateVRattleStepKernel::Name()};
 }
 
-void VariableStepRattleIntegrator::stateChanged(OpenMM::State::DataType) {
+void VariableStepRattleIntegrator::stateChanged(State::DataType changed) {
+    reinitializationPhase = None;
+    // What is announced after loading a checkpoint has been read from it and is no change.
+    if (numChangesAfterLoading < NUM_CHANGES_AFTER_LOADING &&
+        changed == CHANGES_AFTER_LOADING[numChangesAfterLoading]) {
+        numChangesAfterLoading++;
+        return;
+    }
+    numChangesAfterLoading = NUM_CHANGES_AFTER_LOADING;
     kernel.getAs<IntegrateVRattleStepKernel>().stateChanged();
 }
 
@@ -297,6 +347,110 @@ double VariableStepRattleIntegrator::computeKineticEnergy() {
 
 bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
     return false;
+}
+
+// ---------------------------------------------------------------------------------------------- saving and restoring
+
+VRattleRunState VariableStepRattleIntegrator::saveRun() const {
+    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
+    VRattleRunState run = stateful.getAs<IntegrateVRattleStepKernel>().saveRun(*context, *this);
+    run.lastStepSize = lastStepSize;
+    return run;
+}
+
+void VariableStepRattleIntegrator::copySettings(const VariableStepRattleIntegrator& other) {
+    nominalStepSize = other.nominalStepSize;
+    Integrator::setStepSize(nominalStepSize);
+    minimumStepSize = other.minimumStepSize;
+    maximumStepSize = other.maximumStepSize;
+    updateMethod = other.updateMethod;
+    monitors = other.monitors;
+    monitorForceGroup = other.monitorForceGroup;
+    normOrder = other.normOrder;
+    Integrator::setConstraintTolerance(other.getConstraintTolerance());
+    setIntegrationForceGroups(other.getIntegrationForceGroups());
+    settingsChanged();
+}
+
+void VariableStepRattleIntegrator::resumeRun(const VariableStepRattleIntegrator& saved, const VRattleRunState& run) {
+    VariableStepRattleIntegrator previous(nominalStepSize);
+    previous.copySettings(*this);
+    try {
+        copySettings(saved);
+        kernel.getAs<IntegrateVRattleStepKernel>().resumeRun(*context, *this, run);
+        lastStepSize = run.lastStepSize;
+    }
+    catch (...) {
+        copySettings(previous);
+        throw;
+    }
+}
+
+void VariableStepRattleIntegrator::createCheckpoint(std::ostream& stream) const {
+    std::ostringstream settings, data;
+    XmlSerializer::serialize(this, "Integrator", settings);
+    const string text = settings.str();
+    const long long length = (long long) text.size();
+    data.write(reinterpret_cast<const char*>(&length), sizeof(length));
+    data.write(text.data(), length);
+    saveRun().write(data);
+    CheckpointBlock::write(stream, data.str());
+    reinitializationPhase = CheckpointWritten;
+}
+
+void VariableStepRattleIntegrator::loadCheckpoint(std::istream& stream) {
+    const bool isReinitializing = reinitializationPhase == CleanedUp;
+    reinitializationPhase = None;
+    try {
+        std::istringstream data(CheckpointBlock::read(stream));
+        long long length = 0;
+        data.read(reinterpret_cast<char*>(&length), sizeof(length));
+        string text(length, ' ');
+        data.read(&text[0], length);
+        std::istringstream settings(text);
+        std::unique_ptr<VariableStepRattleIntegrator> saved(
+            XmlSerializer::deserialize<VariableStepRattleIntegrator>(settings));
+        VRattleRunState run;
+        run.read(data);
+        // Whoever has changed the masses or constraints calls reinitialize(), and may keep the positions.
+        const bool isSameSystem = run.system == kernel.getAs<IntegrateVRattleStepKernel>().getSystemFingerprint();
+        if (!isSameSystem && !isReinitializing)
+            throw OpenMMException(
+                "VariableStepRattleIntegrator: this checkpoint was made with another System, whose "
+                "masses or constraints are not those of this one; load it into a Context of that System");
+        resumeRun(*saved, run);
+        numChangesAfterLoading = 0;
+    }
+    catch (...) {
+        // The positions of the Context are those of the checkpoint by now.
+        kernel.getAs<IntegrateVRattleStepKernel>().stateChanged();
+        throw;
+    }
+}
+
+void VariableStepRattleIntegrator::serializeParameters(SerializationNode& node) const {
+    node.setIntProperty("version", PARAMETERS_VERSION);
+    node.setStringProperty("integrator", TYPE_NAME);
+    node.createChildNode("Settings", this);
+    saveRun().write(node.createChildNode("Run"));
+}
+
+void VariableStepRattleIntegrator::deserializeParameters(const SerializationNode& node) {
+    if (node.getProperties().empty() && node.getChildren().empty())
+        return; // of an integrator without parameters: there is nothing to go on from
+    if (node.getStringProperty("integrator", "") != TYPE_NAME)
+        throw OpenMMException("VariableStepRattleIntegrator: the State holds the parameters of another integrator; "
+                              "make it without them, by getState(integratorParameters=False)");
+    const int version = node.getIntProperty("version");
+    if (version != PARAMETERS_VERSION)
+        throw OpenMMException("VariableStepRattleIntegrator: the State holds parameters in version " +
+                              std::to_string(version) + " of their format and this plugin reads version " +
+                              std::to_string(PARAMETERS_VERSION) + "; use the version of the plugin that wrote them");
+    std::unique_ptr<VariableStepRattleIntegrator> saved(
+        node.getChildNode("Settings").decodeObject<VariableStepRattleIntegrator>());
+    VRattleRunState run;
+    run.read(node.getChildNode("Run"));
+    resumeRun(*saved, run);
 }
 
 void VariableStepRattleIntegrator::settingsChanged() {

@@ -7,6 +7,7 @@
 #include "openmm/KernelImpl.h"
 #include "openmm/Platform.h"
 #include "openmm/System.h"
+#include "openmmvrattle/VRattleRunState.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include <string>
 #include <vector>
@@ -47,11 +48,23 @@ public:
     /** Compute the mean of every monitor over a trial run, which leaves the state as it was. */
     virtual std::vector<double> calibrate(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                           int steps) = 0;
+    /** The fingerprint of the masses and constraints that initialize() was given. */
+    virtual unsigned long long getSystemFingerprint() const = 0;
+    /** Write down what the run needs to go on; the size of the last step is the integrator's to add. */
+    virtual VRattleRunState saveRun(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator) = 0;
+    /**
+     * Go on from a saved run, whose settings the integrator has already, with the positions and velocities that the
+     * Context has now. Where these are not those of the saved run, or the masses and constraints are others, or the
+     * forces turn out to be others at the next step, the run starts afresh with the saved reference values.
+     */
+    virtual void resumeRun(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                           const VRattleRunState& run) = 0;
     virtual double computeKineticEnergy(OpenMM::ContextImpl& context) = 0;
     /** The step density of the last step. */
     virtual double getStepDensity() const = 0;
     /** The reference value in force of a monitor, 0 if there is none yet. */
-    virtual double getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator, int index) = 0;
+    virtual double getReferenceMonitorValue(OpenMM::ContextImpl& context,
+                                            const VariableStepRattleIntegrator& integrator, int index) = 0;
     /** The value of a monitor at the current state. */
     virtual double getMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                    int index) = 0;

@@ -7,10 +7,13 @@
 #include "openmm/Integrator.h"
 #include "openmm/Kernel.h"
 #include "openmmvrattle/windowsExportVRattle.h"
+#include <iosfwd>
 #include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
+
+struct VRattleRunState;
 
 /**
  * An integrator for molecular dynamics with constraints whose step size varies and which is nevertheless
@@ -36,6 +39,17 @@ namespace OpenMMVRattle {
  * plus potential energy of a State is the energy at that time.
  *
  * A step that cannot be completed throws an OpenMMException and leaves the Context in the state before that step.
+ *
+ * OpenMM's XmlSerializer stores all settings. Checkpoints, and States made with integrator parameters, store the
+ * settings and everything else that the next step depends on, and loading one brings all of it back, the settings as
+ * well: a run that goes on from a checkpoint is the same to the last bit on the Reference platform, and from a State to
+ * rounding. At the first step after that the forces are computed once more. If they are not those of the saved run,
+ * because a Force has been changed in the meantime, or if a State's positions or velocities are not the Context's, the
+ * run starts afresh with the saved reference values.
+ *
+ * Drude particles are refused, for they need an integrator that keeps them at their energy minimum or at a temperature
+ * of their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter
+ * of OpenMM's RPMDIntegrator, which takes the place of this one.
  */
 class OPENMMVRATTLE_EXPORT VariableStepRattleIntegrator : public OpenMM::Integrator {
 public:
@@ -96,6 +110,10 @@ public:
     double getStepSize() const override;
     /** The same as setNominalStepSize(), so that scripts written for a fixed step keep working. */
     void setStepSize(double size) override;
+    /** Get whether a minimum step size was set; if not, it follows the nominal step size. */
+    bool hasMinimumStepSize() const;
+    /** Get whether a maximum step size was set; if not, it follows the nominal step size. */
+    bool hasMaximumStepSize() const;
     /** Get the smallest step size the monitor can ask for (in ps), or 0 if there is no bound. */
     double getMinimumStepSize() const;
     /**
@@ -202,7 +220,10 @@ public:
      * @return the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles
      */
     std::vector<double> getMultipliers() const;
-    /** Get how often the forces have been computed for this integrator since the Context was created. */
+    /**
+     * Get how often the forces have been computed for this integrator since the Context was created or reinitialized.
+     * This and the following counts go on when a checkpoint or a State is loaded.
+     */
     long long getNumForceEvaluations() const;
     /** Get how many iterations the solver of the constraints has taken since the Context was created. */
     long long getNumSolverIterations() const;
@@ -246,6 +267,10 @@ protected:
     void stateChanged(OpenMM::State::DataType changed) override;
     double computeKineticEnergy() override;
     bool kineticEnergyRequiresForce() const override;
+    void createCheckpoint(std::ostream& stream) const override;
+    void loadCheckpoint(std::istream& stream) override;
+    void serializeParameters(OpenMM::SerializationNode& node) const override;
+    void deserializeParameters(const OpenMM::SerializationNode& node) override;
 
 private:
     struct Monitor {
@@ -257,6 +282,9 @@ private:
     void checkMonitorIndex(int index) const;
     void checkBounds(double nominal, double minimum, double maximum) const;
     double advance(double maxTime);
+    VRattleRunState saveRun() const;
+    void resumeRun(const VariableStepRattleIntegrator& saved, const VRattleRunState& run);
+    void copySettings(const VariableStepRattleIntegrator& other);
     double nominalStepSize, lastStepSize;
     // The bounds in ps; a negative number stands for the default, which follows the nominal step size.
     double minimumStepSize, maximumStepSize;
@@ -265,6 +293,11 @@ private:
     int monitorForceGroup;
     double normOrder;
     OpenMM::Kernel kernel;
+    // Context::reinitialize() writes a checkpoint, cleans up, and loads it: how far this has gone.
+    enum ReinitializationPhase { None, CheckpointWritten, CleanedUp };
+    mutable ReinitializationPhase reinitializationPhase;
+    // How many of the changes that OpenMM announces after it has loaded a checkpoint have come.
+    int numChangesAfterLoading;
 };
 
 } // namespace OpenMMVRattle

@@ -4,6 +4,8 @@
 #include "ReferenceVRattleKernels.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/internal/ContextImpl.h"
+#include "openmmvrattle/Fingerprint.h"
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <sstream>
@@ -18,6 +20,8 @@ using std::vector;
 namespace {
 
 const int NO_MONITOR_GROUP = -1;
+// Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
+const double FORCE_ROUNDING = 1e-4;
 
 [[noreturn]] void throwFailure(const std::string& what, double time, const std::string& reason,
                                const std::string& wayOut) {
@@ -36,6 +40,19 @@ void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, co
                                       std::to_string(i) + " is not a finite number; set it before stepping");
 }
 
+// Whether two sets of forces are the same but for rounding; a particle in equilibrium is measured by the others.
+bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
+    double meanSquare = 0;
+    for (const Vec3& force : a)
+        meanSquare += force.dot(force) / a.size();
+    for (size_t i = 0; i < a.size(); i++) {
+        const Vec3 change = b[i] - a[i];
+        if (!(change.dot(change) <= FORCE_ROUNDING * FORCE_ROUNDING * std::max(meanSquare, a[i].dot(a[i]))))
+            return false;
+    }
+    return true;
+}
+
 } // namespace
 
 void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
@@ -51,11 +68,13 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
             throw OpenMMException("VariableStepRattleIntegrator: constraint " + std::to_string(i) +
                                   " of the System has a length that is not a positive finite number");
     }
+    systemFingerprint = VRattleRunState::fingerprintOf(system);
     dynamics.reset(new VRattleDynamics(masses, constraints));
     isContextAhead = false;
     forceGroups = 0;
     monitorForceGroup = NO_MONITOR_GROUP;
     areSettingsChanged = isStateChanged = true;
+    restored.reset();
     lastDensity = 1;
     numForceEvaluations = 0;
     readSettings(integrator);
@@ -105,6 +124,7 @@ void ReferenceIntegrateVRattleStepKernel::readSettings(const VariableStepRattleI
 // Bring the method's state in line with the Context, which may have been changed in between.
 void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                                   bool forcesInvalid) {
+    takeRestored(context);
     if (areSettingsChanged)
         readSettings(integrator);
     int groups = integrator.getIntegrationForceGroups();
@@ -298,6 +318,155 @@ vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& conte
     return means;
 }
 
+unsigned long long ReferenceIntegrateVRattleStepKernel::getSystemFingerprint() const {
+    return systemFingerprint;
+}
+
+VRattleRunState ReferenceIntegrateVRattleStepKernel::saveRun(ContextImpl& context,
+                                                             const VariableStepRattleIntegrator& integrator) {
+    takeRestored(context);
+    if (areSettingsChanged)
+        readSettings(integrator);
+    const VRattleDynamics::Memory memory = dynamics->getMemory();
+    VRattleRunState run;
+    run.system = systemFingerprint;
+    run.context = fingerprintOfContext();
+    run.lastDensity = lastDensity;
+    run.references = memory.references;
+    run.startsAfresh = isStateChanged;
+    if (run.startsAfresh)
+        return run;
+    run.forceGroups = forceGroups;
+    run.halfStepVelocities = memory.halfStepVelocities;
+    run.methodValues = {{"hasDensity", {(double) memory.hasDensity}},
+                        {"density", {memory.density}},
+                        {"multiplierOffset", memory.multiplierOffset},
+                        {"multipliers", memory.multipliers},
+                        {"monitorValues", memory.monitorValues},
+                        {"hasHalfStepValue", {(double) memory.hasHalfStepValue}},
+                        {"u", {memory.u}},
+                        {"halfStepValue", {memory.halfStepValue}},
+                        {"rate", {memory.rate}},
+                        {"densityOffset", {memory.densityOffset}}};
+    run.forces = dynamics->getForces();
+    run.groupEnergy = dynamics->getGroupEnergy();
+    std::copy(boxVectors, boxVectors + 3, run.boxVectors);
+    if (differ(*data.positions, dynamics->getPositions()))
+        run.positions = dynamics->getPositions();
+    if (differ(*data.velocities, dynamics->getVelocities()))
+        run.velocities = dynamics->getVelocities();
+    run.isContextAhead = isContextAhead;
+    if (isContextAhead && differ(*data.positions, contextPositions))
+        run.contextPositions = contextPositions;
+    if (isContextAhead && differ(*data.velocities, contextVelocities))
+        run.contextVelocities = contextVelocities;
+    return run;
+}
+
+VRattleDynamics::Memory ReferenceIntegrateVRattleStepKernel::memoryOf(const VRattleRunState& run) const {
+    const size_t numConstraints = dynamics->getConstraintSystem().getNumConstraints();
+    VRattleDynamics::Memory memory = {};
+    memory.hasDensity = run.getMethodValue("hasDensity") != 0;
+    memory.density = run.getMethodValue("density");
+    memory.halfStepVelocities = run.halfStepVelocities;
+    memory.multiplierOffset = run.getMethodValues("multiplierOffset", numConstraints);
+    memory.references = run.references;
+    memory.multipliers = run.getMethodValues("multipliers", numConstraints);
+    memory.monitorValues = run.getMethodValues("monitorValues", run.references.size());
+    memory.hasHalfStepValue = run.getMethodValue("hasHalfStepValue") != 0;
+    memory.u = run.getMethodValue("u");
+    memory.halfStepValue = run.getMethodValue("halfStepValue");
+    memory.rate = run.getMethodValue("rate");
+    memory.densityOffset = run.getMethodValue("densityOffset");
+    return memory;
+}
+
+void ReferenceIntegrateVRattleStepKernel::resumeRun(ContextImpl&, const VariableStepRattleIntegrator& integrator,
+                                                    const VRattleRunState& run) {
+    const bool isSameSystem = run.system == systemFingerprint;
+    if (isSameSystem)
+        run.requireSizes((int) masses.size(), integrator.getNumMonitors());
+    VRattleDynamics::Memory memory = {};
+    if (isSameSystem && !run.startsAfresh)
+        memory = memoryOf(run);
+    restored.reset();
+    readSettings(integrator);
+    if ((int) run.references.size() == integrator.getNumMonitors())
+        dynamics->setReferences(run.references);
+    lastDensity = run.lastDensity;
+    isContextAhead = false;
+    isStateChanged = run.startsAfresh || !isSameSystem || run.context != fingerprintOfContext();
+    if (isStateChanged)
+        return;
+    restoredMemory = memory;
+    restored.reset(new VRattleRunState(run));
+    if (run.positions.empty())
+        restored->positions = *data.positions;
+    if (run.velocities.empty())
+        restored->velocities = *data.velocities;
+    if (run.contextPositions.empty())
+        restored->contextPositions = *data.positions;
+    if (run.contextVelocities.empty())
+        restored->contextVelocities = *data.velocities;
+}
+
+// Go on from a restored run, unless the user has changed the state since, or the forces turn out to be others.
+void ReferenceIntegrateVRattleStepKernel::takeRestored(ContextImpl& context) {
+    if (restored != nullptr && !isStateChanged) {
+        try {
+            dynamics->resume(restored->positions, restored->velocities, restored->forces, restored->groupEnergy,
+                             restoredMemory);
+        }
+        catch (const StepFailure& failure) {
+            throwFailure("going on from a saved run", data.time, failure.what(), "");
+        }
+        isContextAhead = restored->isContextAhead;
+        contextPositions = restored->contextPositions;
+        contextVelocities = restored->contextVelocities;
+        forceGroups = restored->forceGroups;
+        std::copy(restored->boxVectors, restored->boxVectors + 3, boxVectors);
+        isStateChanged = !areForcesAsRestored(context);
+    }
+    restored.reset();
+}
+
+// Computes the forces where the restored ones belong to, and takes them over if these are the same but for rounding.
+bool ReferenceIntegrateVRattleStepKernel::areForcesAsRestored(ContextImpl& context) {
+    if (differ(*data.positions, knownPositions()) || !std::equal(boxVectors, boxVectors + 3, data.periodicBoxVectors))
+        return true; // they will be computed for other reasons
+    const bool isElsewhere = isContextAhead && differ(*data.positions, dynamics->getPositions());
+    if (isElsewhere) {
+        writeMoving(dynamics->getPositions(), *data.positions);
+        context.computeVirtualSites();
+    }
+    double energy;
+    try {
+        energy = computeForces(context);
+    }
+    catch (...) {
+        putBack(context);
+        throw;
+    }
+    const vector<Vec3> forces = *data.forces;
+    if (isElsewhere)
+        putBack(context);
+    const double larger = std::max(std::fabs(energy), std::fabs(restored->groupEnergy));
+    if (!agree(forces, restored->forces) || !(std::fabs(energy - restored->groupEnergy) <= FORCE_ROUNDING * larger))
+        return false;
+    dynamics->resume(restored->positions, restored->velocities, forces, energy, restoredMemory);
+    return true;
+}
+
+unsigned long long ReferenceIntegrateVRattleStepKernel::fingerprintOfContext() const {
+    Fingerprint fingerprint;
+    for (size_t i = 0; i < masses.size(); i++)
+        if (masses[i] > 0) {
+            fingerprint.add((*data.positions)[i]);
+            fingerprint.add((*data.velocities)[i]);
+        }
+    return fingerprint.get();
+}
+
 double ReferenceIntegrateVRattleStepKernel::computeKineticEnergy(ContextImpl&) {
     double sum = 0;
     for (size_t i = 0; i < masses.size(); i++)
@@ -309,10 +478,13 @@ double ReferenceIntegrateVRattleStepKernel::getStepDensity() const {
     return lastDensity;
 }
 
-double ReferenceIntegrateVRattleStepKernel::getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator,
+double ReferenceIntegrateVRattleStepKernel::getReferenceMonitorValue(ContextImpl& context,
+                                                                     const VariableStepRattleIntegrator& integrator,
                                                                      int index) {
-    if (areSettingsChanged)
+    if (areSettingsChanged) {
+        takeRestored(context);
         readSettings(integrator);
+    }
     return dynamics->getReference(index);
 }
 

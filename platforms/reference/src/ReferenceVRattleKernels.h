@@ -30,9 +30,14 @@ public:
     void reverse(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator) override;
     std::vector<double> calibrate(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                   int steps) override;
+    unsigned long long getSystemFingerprint() const override;
+    VRattleRunState saveRun(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator) override;
+    void resumeRun(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                   const VRattleRunState& run) override;
     double computeKineticEnergy(OpenMM::ContextImpl& context) override;
     double getStepDensity() const override;
-    double getReferenceMonitorValue(const VariableStepRattleIntegrator& integrator, int index) override;
+    double getReferenceMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
+                                    int index) override;
     double getMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                            int index) override;
     std::vector<double> getMultipliers(OpenMM::ContextImpl& context,
@@ -45,6 +50,10 @@ private:
     void readSettings(const VariableStepRattleIntegrator& integrator);
     void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
     void startAfresh(OpenMM::ContextImpl& context);
+    VRattleDynamics::Memory memoryOf(const VRattleRunState& run) const;
+    void takeRestored(OpenMM::ContextImpl& context);
+    bool areForcesAsRestored(OpenMM::ContextImpl& context);
+    unsigned long long fingerprintOfContext() const;
     void noteContext();
     const std::vector<OpenMM::Vec3>& knownPositions() const;
     const std::vector<OpenMM::Vec3>& knownVelocities() const;
@@ -57,6 +66,7 @@ private:
     OpenMM::ReferencePlatform::PlatformData& data;
     std::vector<double> masses;
     std::vector<DistanceConstraint> constraints;
+    unsigned long long systemFingerprint;
     std::unique_ptr<VRattleDynamics> dynamics;
     VRattleDynamics::Settings settings;
     OpenMM::Vec3 boxVectors[3];
@@ -66,6 +76,9 @@ private:
     // until the next step is complete. Then these hold what the Context has.
     bool isContextAhead;
     std::vector<OpenMM::Vec3> contextPositions, contextVelocities;
+    // A run to go on from, until it is needed: only then can the forces be compared with its own.
+    std::unique_ptr<VRattleRunState> restored;
+    VRattleDynamics::Memory restoredMemory;
     double lastDensity;
     long long numForceEvaluations;
 };

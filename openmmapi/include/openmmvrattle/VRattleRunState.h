@@ -1,0 +1,65 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_VRATTLERUNSTATE_H_
+#define OPENMMVRATTLE_VRATTLERUNSTATE_H_
+
+#include "openmm/System.h"
+#include "openmm/Vec3.h"
+#include "openmm/serialization/SerializationNode.h"
+#include "openmmvrattle/windowsExportVRattle.h"
+#include <iosfwd>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * What a run needs to go on as if nothing had happened, beside the settings of the integrator and the positions,
+ * velocities and parameters of the Context. Checkpoints and States hold it.
+ *
+ * The forces are in it to be compared with those at the restored positions: a State may be given to a Context whose
+ * forces are others, and then the run must start afresh.
+ */
+struct OPENMMVRATTLE_EXPORT VRattleRunState {
+    /** Fingerprint of the masses and the constraints. */
+    static unsigned long long fingerprintOf(const OpenMM::System& system);
+
+    /** Write or read everything, in binary form with a stream and as text with a SerializationNode. */
+    void write(std::ostream& stream) const;
+    void read(std::istream& stream);
+    void write(OpenMM::SerializationNode& node) const;
+    void read(const OpenMM::SerializationNode& node);
+    /** Throw an OpenMMException unless every list has the length that fits. */
+    void requireSizes(int numParticles, int numMonitors) const;
+    /** The method's numbers of a name; throws an OpenMMException if they are not there or not as many as wanted. */
+    const std::vector<double>& getMethodValues(const std::string& name, size_t count) const;
+    double getMethodValue(const std::string& name) const {
+        return getMethodValues(name, 1)[0];
+    }
+
+    unsigned long long system = 0;     // fingerprint of the System
+    unsigned long long context = 0;    // fingerprint of the positions and velocities in the Context
+    double lastStepSize = 0;           // ps; 0 before the first step
+    double lastDensity = 1;            // rho of the last step
+    std::vector<double> references;    // U_k,ref in force, 0 if not known
+    bool startsAfresh = true;          // no step since the user changed the state: nothing of what follows is there
+
+    int forceGroups = 0;               // those that act
+    // The numbers that the method goes on with, by names that the platform gives them.
+    std::map<std::string, std::vector<double>> methodValues;
+    std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
+    std::vector<OpenMM::Vec3> forces;  // F(q[n])
+    double groupEnergy = 0;            // of the monitor's force group at q[n], kJ/mol
+    OpenMM::Vec3 boxVectors[3];        // those of the forces
+    // q[n] and M^-1 p[n], where they are not those in the Context; empty if they are.
+    std::vector<OpenMM::Vec3> positions, velocities;
+    // Where the Context's state is not the method's: what the method knows of the former, if it has changed since.
+    bool isContextAhead = false;
+    std::vector<OpenMM::Vec3> contextPositions, contextVelocities;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_VRATTLERUNSTATE_H_

@@ -1,0 +1,68 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "CheckpointBlock.h"
+#include "openmm/OpenMMException.h"
+#include "openmmvrattle/Fingerprint.h"
+#include <algorithm>
+#include <cstring>
+#include <istream>
+#include <ostream>
+
+using namespace OpenMMVRattle;
+using OpenMM::OpenMMException;
+using std::string;
+
+namespace {
+
+const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
+const int VERSION = 1;
+const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
+
+unsigned long long fingerprintOf(const string& data) {
+    Fingerprint fingerprint;
+    fingerprint.addBytes(data.data(), data.size());
+    return fingerprint.get();
+}
+
+template <class T> bool readValue(std::istream& stream, T& value) {
+    return bool(stream.read(reinterpret_cast<char*>(&value), sizeof(T)));
+}
+
+} // namespace
+
+void CheckpointBlock::write(std::ostream& stream, const string& data) {
+    const long long length = (long long) data.size();
+    const unsigned long long fingerprint = fingerprintOf(data);
+    stream.write(MARK, sizeof(MARK));
+    stream.write(reinterpret_cast<const char*>(&VERSION), sizeof(VERSION));
+    stream.write(reinterpret_cast<const char*>(&length), sizeof(length));
+    stream.write(reinterpret_cast<const char*>(&fingerprint), sizeof(fingerprint));
+    stream.write(data.data(), length);
+}
+
+string CheckpointBlock::read(std::istream& stream) {
+    char mark[sizeof(MARK)];
+    if (!stream.read(mark, sizeof(MARK)) || std::memcmp(mark, MARK, sizeof(MARK)) != 0)
+        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint was not made with a "
+                              "VariableStepRattleIntegrator, so the run cannot go on from it");
+    int version = 0;
+    if (readValue(stream, version) && version != VERSION)
+        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is written in version " +
+                              std::to_string(version) + " of its format and this plugin reads version " +
+                              std::to_string(VERSION) + "; use the version of the plugin that wrote it");
+    long long length = 0;
+    unsigned long long fingerprint = 0;
+    string data;
+    if (readValue(stream, length) && readValue(stream, fingerprint)) {
+        while ((long long) data.size() < length && stream) {
+            const size_t size = data.size(), wanted = (size_t) std::min(CHUNK, length - (long long) size);
+            data.resize(size + wanted);
+            stream.read(&data[size], wanted);
+            data.resize(size + (size_t) stream.gcount());
+        }
+    }
+    if (!stream || (long long) data.size() != length || fingerprintOf(data) != fingerprint)
+        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is damaged or cut short");
+    return data;
+}

@@ -1,0 +1,30 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATORPROXY_H_
+#define OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATORPROXY_H_
+
+#include "openmm/serialization/SerializationProxy.h"
+#include "openmmvrattle/windowsExportVRattle.h"
+
+namespace OpenMMVRattle {
+
+/**
+ * Writes the settings of a VariableStepRattleIntegrator to a SerializationNode, and makes a new integrator of them, for
+ * OpenMM's XmlSerializer. The same text carries the settings in checkpoints and States.
+ *
+ * A step bound that was not set is not written, so that it goes on following the nominal step size.
+ */
+class OPENMMVRATTLE_EXPORT VariableStepRattleIntegratorProxy : public OpenMM::SerializationProxy {
+public:
+    VariableStepRattleIntegratorProxy();
+    void serialize(const void* object, OpenMM::SerializationNode& node) const override;
+    void* deserialize(const OpenMM::SerializationNode& node) const override;
+};
+
+} // namespace OpenMMVRattle
+
+/** Make our classes known to OpenMM's XmlSerializer. This happens by itself when the library is loaded. */
+extern "C" OPENMMVRATTLE_EXPORT void registerVRattleSerializationProxies();
+
+#endif // OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATORPROXY_H_
