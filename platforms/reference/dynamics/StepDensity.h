@@ -22,9 +22,9 @@ public:
      */
     StepDensity(Update update, double nominal, double minimum, double maximum);
     /**
-     * B(u), the Moebius function through (0, lower), (1, 1) and (infinity, nominal/minimum) (METHOD section 6, after
-     * Leimkuhler and Reich, Simulating Hamiltonian Dynamics, section 9.3.3), where lower is nominal/maximum; for the update
-     * Bounded it is a little larger, so that f(B(u)) stays finite.
+     * B(u), the Moebius function through (0, lower), (1, 1) and (infinity, nominal/minimum) (docs/method.md, section 6,
+     * after Leimkuhler and Reich, Simulating Hamiltonian Dynamics, section 9.3.3), where lower is nominal/maximum; for
+     * the update Bounded it is a little larger, so that f(B(u)) stays finite.
      */
     double limit(double u) const;
     /** dB/du. */

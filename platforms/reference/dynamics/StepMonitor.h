@@ -12,7 +12,7 @@
 namespace OpenMMVRattle {
 
 /**
- * The monitors U_k(q,p) of METHOD section 4, their combination
+ * The monitors U_k(q,p) of docs/method.md, section 4, their combination
  *
  *     u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2),
  *

@@ -368,7 +368,7 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     rescaleDensity(u);
 }
 
-// p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (METHOD section 7)
+// p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
 void VRattleDynamics::formHalfStepVelocities() {
     ensureFactor(FullFactor);
     const double kick = 0.5 * settings.stepSize / rho;
@@ -561,7 +561,7 @@ double VRattleDynamics::coupledPassGeneral(double kick, double drift) {
     return error;
 }
 
-// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (METHOD section 8), for all
+// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (docs/method.md, section 8), for all
 // constraints. Where the coupled chord iteration fails.
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     ensureFactor(FullFactor);
@@ -578,7 +578,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         computeTrial(w, kick, drift, movingParticles, 0);
         lastError = system.evaluate(qNext, residual);
         const double uPlus = evaluateU(wNext);
-        const double mismatch = rhoNext + rho - uPlus - uMinus; // F of METHOD section 8
+        const double mismatch = rhoNext + rho - uPlus - uMinus; // F of docs/method.md, section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
                                       relativeMismatch / std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING));
@@ -711,11 +711,12 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
     vector<double> backValues;
     const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
+    const vector<double> startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
     if (stepKind == Regular)
         keepOffsets();
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
     evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaNext, rightSideNext, valuesNext, withHalfStep);
-    if (isStart && !startDensityFrom(backValues, hasBack))
+    if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
     hasHalfStepValue = withHalfStep;
     if (withHalfStep) {
@@ -769,7 +770,8 @@ void VRattleDynamics::reverse() {
 
 /*
  * The recursion of the density keeps an oscillation of rho about u for ever, so it must start without one. The smooth
- * solution is rho[1/2] = u0 + (u1 - u-1)/4 + O(h^3), which follows from METHOD section 7. The first step is a step of
+ * solution is rho[1/2] = u0 + (u1 - u-1)/4 + O(h^3), u0 being u(q0,p0), or for (3.14) the mean of u(q0,p1/2) and
+ * u(q0,p-1/2); which follows from docs/method.md, section 7. The first step is a step of
  * plain RATTLE from the on-step state, which gives u1 with the one force evaluation that the step costs anyway; u-1
  * comes from a step backwards, whose forces are extrapolated along the path from those at q0 and q1, exactly so where
  * the motion starts at rest (and then q-1 = q1) or the forces are constant.
@@ -805,8 +807,19 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
     return true;
 }
 
+// The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
+vector<double> VRattleDynamics::evaluateHalfSteps() {
+    evaluateU(wNext);
+    vector<double> result = valuesTrial;
+    evaluateU(wBack);
+    for (size_t k = 0; k < result.size(); k++)
+        result[k] = 0.5 * (result[k] + valuesTrial[k]);
+    return result;
+}
+
 // Returns whether the first step stands; if not, firstDensity says with which density to take it again.
-bool VRattleDynamics::startDensityFrom(const vector<double>& backValues, bool hasBack) {
+bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const vector<double>& backValues,
+                                       bool hasBack) {
     const vector<StepMonitor::Term>& terms = monitor.getTerms();
     bool areAllTaken = true;
     for (size_t k = 0; k < terms.size(); k++) {
@@ -820,11 +833,12 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& backValues, bool ha
     }
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].reference == 0)
-            monitor.setReference((int) k, startValue(values[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
+            monitor.setReference((int) k, startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
     if (areAllTaken || firstDensity > 0)
         return true;
     const double back = hasBack ? combineAndLimit(backValues) : 0.0;
-    firstDensity = startValue(combineAndLimit(values), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
+    firstDensity =
+        startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
     return std::fabs(firstDensity - rhoNext) <= 1e-12 * rhoNext;
 }
 

@@ -204,7 +204,8 @@ private:
     [[noreturn]] void throwNotConverged() const;
 
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
-    bool startDensityFrom(const std::vector<double>& backValues, bool hasBack);
+    std::vector<double> evaluateHalfSteps();
+    bool startDensityFrom(const std::vector<double>& startValues, const std::vector<double>& backValues, bool hasBack);
     static double startValue(double start, double ahead, const double* back);
 
     ConstraintSystem system;
