@@ -150,18 +150,17 @@ def test_start_in_motion(name: str, update: str, factor: float) -> None:
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.7])
 @pytest.mark.parametrize("update", UPDATES)
 def test_start_at_rest(update: str, factor: float) -> None:
-    """At rest rho = U is itself the smooth start, u' = 0, and there is nothing to gain on it: it must be kept.
+    """At rest u' = 0, and rho = U is itself the smooth start of (3.15): it must be kept.
 
-    (3.14) alone has an oscillation then: it takes u at the half-step momenta, and that differs from u(q0,0) by a term
-    of second order in h.
+    (3.14) takes u at the half-step momenta, and that differs from u(q0,0) by a term of second order in h, which rho = U
+    leaves as an oscillation.
     """
     make, time, steps = REST
     ours, papers = measured(make(), time, steps, update, factor)
     if update == SEMI_EXPLICIT:
-        # A hundredth more: the first step of the integrator is one of plain RATTLE.
-        assert np.all(ours < 1.01 * papers)
+        assert np.all(papers > 10 * ours)
+        assert slope(steps, papers) > 1.9
         assert slope(steps, ours) > 1.9
-        assert np.all(ours < 1e-4)
     else:
         # No more than 1e-9 at the coarsest step, less than any tolerance: measured 1e-10, 1e-12 and rounding.
         assert np.all(ours < 1e-9)
