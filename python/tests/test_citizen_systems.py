@@ -46,9 +46,7 @@ def assert_conserves(
         assert np.max(np.abs(positions_of(context) - positions)) > 0.005
         del context
     kinetic = degrees_of_freedom(system) * THERMAL / 2
-    print(
-        f"{platform}: energy error {errors[0] / kinetic:.1e} of kinetic energy, with fixed steps {errors[1] / kinetic:.1e}"
-    )
+    print(f"{platform}: energy error {errors[0] / kinetic:.1e}, with fixed steps {errors[1] / kinetic:.1e}")
     # The kinetic energy of N freedoms fluctuates by sqrt(2/N), 0.05 to 0.2 here; a force that is missing, stale or
     # not a gradient shows as more than 0.01 within these runs.
     assert errors[0] < 0.005 * kinetic
