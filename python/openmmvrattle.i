@@ -89,9 +89,11 @@ RELEASES_GIL(stepTo)
 %feature("autodoc", "0");
 
 %pythoncode %{
+import copy
 import operator
 from collections.abc import Sequence
 
+import openmm
 from openmm import unit
 
 _STEP_UNIT = unit.picosecond
@@ -144,6 +146,22 @@ The velocities in the Context belong to the same time as the positions, and sati
 potential energy of a State is the energy at that time.
 
 A step that cannot be completed raises an OpenMMException and leaves the Context in the state before that step.
+
+OpenMM's XmlSerializer stores all settings; copies and pickles have the settings too, and no Context. Checkpoints, and
+States made with integratorParameters=True, store the settings and everything else that the next step depends on, and
+loading one brings all of it back, the settings as well: a run that goes on from a checkpoint is the same to the last
+bit on the Reference platform, and from a State to rounding. At the first step after that the forces are computed once
+more. If they are not those of the saved run, because a Force has been changed in the meantime, or if a State's
+positions or velocities are not the Context's (they were wrapped into the periodic box, say), the run starts afresh with
+the saved reference values.
+
+OpenMM's own functions that return an integrator, openmm.XmlSerializer.deserialize() and
+CompoundIntegrator.getIntegrator(), return one of ours as a bare openmm.Integrator; cast() makes it a
+VariableStepRattleIntegrator, and openmmvrattle.XmlSerializer does so by itself.
+
+Drude particles are refused, for they need an integrator that keeps them at their energy minimum or at a temperature of
+their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter of
+OpenMM's RPMDIntegrator, which takes the place of this one.
 
 Update methods, for setUpdateMethod(). All are symmetric in time.
 
@@ -649,7 +667,8 @@ def getMultipliers(self) -> unit.Quantity:
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumForceEvaluations %{
 def getNumForceEvaluations(self) -> int:
     r"""
-    Get how often the forces have been computed for this integrator since the Context was created.
+    Get how often the forces have been computed for this integrator since the Context was created or reinitialized.
+    Loading a checkpoint or a State does not change this count, nor the others.
 
     Returns
     -------
@@ -816,6 +835,84 @@ public:
     void step(int steps);
     void stepTo(double time);
     void reverse();
+    %extend {
+        static bool _isinstance(const OpenMM::Integrator* integrator) {
+            return dynamic_cast<const OpenMMVRattle::VariableStepRattleIntegrator*>(integrator) != NULL;
+        }
+        static OpenMMVRattle::VariableStepRattleIntegrator* _cast(OpenMM::Integrator* integrator) {
+            return dynamic_cast<OpenMMVRattle::VariableStepRattleIntegrator*>(integrator);
+        }
+        %pythoncode %{
+            @staticmethod
+            def isinstance(integrator: openmm.Integrator) -> bool:
+                r"""
+                Get whether an integrator is a VariableStepRattleIntegrator, though its class may be openmm.Integrator.
+
+                Parameters
+                ----------
+                integrator : Integrator
+                    any integrator
+
+                Returns
+                -------
+                bool
+                    whether cast() would take it
+                """
+                return _vrattle.VariableStepRattleIntegrator__isinstance(integrator)
+
+            @staticmethod
+            def cast(integrator: openmm.Integrator) -> "VariableStepRattleIntegrator":
+                r"""
+                Make what OpenMM has returned as a bare openmm.Integrator a VariableStepRattleIntegrator again.
+
+                Parameters
+                ----------
+                integrator : Integrator
+                    for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
+
+                Returns
+                -------
+                VariableStepRattleIntegrator
+                    the same Python object, whose class has been changed
+
+                Raises
+                ------
+                TypeError
+                    if it is an integrator of another kind
+                """
+                if isinstance(integrator, VariableStepRattleIntegrator):
+                    return integrator
+                typed = _vrattle.VariableStepRattleIntegrator__cast(integrator)
+                if typed is None:
+                    raise TypeError(f"a {type(integrator).__name__} is not a VariableStepRattleIntegrator")
+                typed.thisown = integrator.thisown
+                integrator.thisown = False
+                integrator.this = typed.this
+                integrator.__class__ = VariableStepRattleIntegrator
+                return integrator
+
+            def _attributes(self) -> dict[str, object]:
+                """Return what Python code has attached to this integrator."""
+                return {name: value for name, value in self.__dict__.items() if name != "this"}
+
+            def __copy__(self) -> "VariableStepRattleIntegrator":
+                duplicate = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.clone(self))
+                duplicate.__class__ = type(self)
+                duplicate.__dict__.update(copy.deepcopy(self._attributes()))
+                return duplicate
+
+            def __deepcopy__(self, memo: dict) -> "VariableStepRattleIntegrator":
+                return self.__copy__()
+
+            def __getstate__(self) -> tuple[str, dict[str, object]]:
+                return openmm.XmlSerializer.serialize(self), self._attributes()
+
+            def __setstate__(self, state: tuple[str, dict[str, object]]) -> None:
+                xml, attributes = state
+                self.this = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.deserialize(xml)).this
+                self.__dict__.update(attributes)
+        %}
+    }
 };
 
 } // namespace OpenMMVRattle

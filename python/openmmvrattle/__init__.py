@@ -18,7 +18,7 @@ import openmm.version
 
 from . import _build
 
-__all__ = ["VariableStepRattleIntegrator", "pluginLoadFailures"]
+__all__ = ["VariableStepRattleIntegrator", "XmlSerializer", "pluginLoadFailures"]
 __version__: str = _build.VERSION
 
 # The platforms that each of our libraries serves. The CPU platform runs the kernels of Reference.
@@ -64,6 +64,7 @@ def _load_plugins(folder: Path) -> list[str]:
 _check_openmm_version(_build.OPENMM_VERSION, openmm.version.short_version)
 
 from . import _vrattle  # noqa: E402
+from .serialization import XmlSerializer  # noqa: E402
 from .vrattle import VariableStepRattleIntegrator  # noqa: E402
 
 # Found from the extension: in an editable install the Python files lie somewhere else.
