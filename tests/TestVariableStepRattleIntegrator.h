@@ -243,7 +243,7 @@ inline void testPendulumEnergy() {
     ASSERT(errors[1] > 1000 * errors[0]);
 }
 
-// The sequence of densities starts without an oscillation about u; METHOD section 7.
+// The sequence of densities starts without an oscillation about u; docs/method.md, section 7.
 inline void testStartWithoutOscillation() {
     double amplitude[2];
     for (int refine = 0; refine < 2; refine++) {

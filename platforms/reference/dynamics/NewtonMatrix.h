@@ -15,7 +15,7 @@
 namespace OpenMMVRattle {
 
 /**
- * The unsymmetric matrix G(q+) M^-1 G(q)^T of the full Newton iteration (A of docs/method.md, section 8, up to a factor),
+ * The unsymmetric matrix G(q+) M^-1 G(q)^T of the full Newton iteration (docs/method.md, section 8: A up to a factor),
  * block by block. It is the fall-back where the chord iteration with K(q) converges slowly, so its memory is taken at
  * the first use.
  */

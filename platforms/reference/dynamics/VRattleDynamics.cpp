@@ -561,8 +561,8 @@ double VRattleDynamics::coupledPassGeneral(double kick, double drift) {
     return error;
 }
 
-// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (docs/method.md, section 8), for all
-// constraints. Where the coupled chord iteration fails.
+// Newton's iteration on (lambda, rho+) for (3.11) and (3.14) by the Schur complement (docs/method.md, section 8), for
+// all constraints. Where the coupled chord iteration fails.
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     ensureFactor(FullFactor);
     const double h = settings.stepSize;
@@ -578,7 +578,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         computeTrial(w, kick, drift, movingParticles, 0);
         lastError = system.evaluate(qNext, residual);
         const double uPlus = evaluateU(wNext);
-        const double mismatch = rhoNext + rho - uPlus - uMinus; // F of docs/method.md, section 8
+        const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
                                       relativeMismatch / std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING));

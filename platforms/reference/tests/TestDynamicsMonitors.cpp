@@ -165,7 +165,7 @@ void testBounds() {
     ASSERT_EQUAL_TOL(37.5, unbounded.limit(37.5), 1e-14);
     StepDensity onlyMaximum(StepDensity::SemiExplicit, nominal, 0, maximum);
     ASSERT_EQUAL_TOL(0.4 + 0.6 * 37.5, onlyMaximum.limit(37.5), 1e-14);
-    // The update Bounded starts B a little higher, so that f(B) is finite: METHOD section 3.
+    // The update Bounded starts B a little higher, so that f(B) is finite: docs/method.md, section 3.
     StepDensity bounded(StepDensity::Bounded, nominal, minimum, maximum);
     ASSERT_EQUAL_TOL(std::min(4 * 0.4 / 3, (1 + 2 * 0.4) / 3), bounded.limit(0), 1e-14);
     ASSERT_EQUAL_TOL(1.0, bounded.limit(1), 1e-14);
