@@ -343,7 +343,8 @@ inline void testInitialTemperature() {
     context.setPositions(positions);
     context.setVelocitiesToTemperature(temperature);
     double kinetic = 0;
-    for (const Vec3& v : context.getState(State::Velocities).getVelocities())
+    const vector<Vec3> velocities = context.getState(State::Velocities).getVelocities();
+    for (const Vec3& v : velocities)
         kinetic += 0.5 * v.dot(v);
     // 150,000 freedoms: standard error of 0.4 %, as in OpenMM's test.
     ASSERT_USUALLY_EQUAL_TOL(temperature, 2 * kinetic / (3 * numParticles * BOLTZMANN), 0.01);
@@ -385,10 +386,8 @@ inline TestList getBehaviourTests() {
         tests.push_back({"constraints" + suffix, [=] { testConstraints(update); }});
         tests.push_back({"constrained clusters" + suffix, [=] { testConstrainedClusters(update); }});
         tests.push_back({"velocity constraints" + suffix, [=] { testVelocityConstraints(update); }});
-        tests.push_back(
-            {"chain of 10" + suffix, [=] { testConstrainedChain(10, 1000, update); }});
-        tests.push_back(
-            {"chain of 1500" + suffix, [=] { testConstrainedChain(1500, 300, update); }});
+        tests.push_back({"chain of 10" + suffix, [=] { testConstrainedChain(10, 1000, update); }});
+        tests.push_back({"chain of 1500" + suffix, [=] { testConstrainedChain(1500, 300, update); }});
         tests.push_back({"argon box" + suffix, [=] { testArgonBox(update); }});
     }
     tests.push_back({"constrained massless particles", testConstrainedMasslessParticles});
