@@ -7,6 +7,7 @@
 #include "ConstraintMatrix.h"
 #include "ConstraintSystem.h"
 #include "openmm/Vec3.h"
+#include <cmath>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -69,6 +70,10 @@ public:
      * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
      */
     void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Whether the forces of the last setForces() were all finite. */
+    bool hasFiniteForces() const {
+        return std::isfinite(forceSquared);
+    }
     /** The forces of the last setForces(). */
     const std::vector<OpenMM::Vec3>& getForces() const {
         return *forces;

@@ -33,13 +33,6 @@ double dot(const vector<double>& a, const vector<double>& b) {
     return sum;
 }
 
-bool isFinite(const vector<Vec3>& vectors) {
-    double sum = 0;
-    for (const Vec3& x : vectors)
-        sum += 0 * (x[0] + x[1] + x[2]); // a NaN or an infinity gives a NaN
-    return sum == 0;
-}
-
 } // namespace
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
@@ -200,6 +193,8 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
     for (int i : system.getFreeParticles())
         velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]);
     monitor.setForces(forces, energy);
+    if (!monitor.hasFiniteForces())
+        throw StepFailure("the force on a particle is infinite or not a number");
     monitor.evaluate(velocities, multipliers, rightSides, monitorValues);
     monitor.requireValid(monitorValues);
     if (withHalfStep)
@@ -294,8 +289,6 @@ bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
 
 void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                             double energy) {
-    if (!isFinite(forces))
-        throw StepFailure("the force on a particle is not a number or infinite");
     q = positions;
     v = velocities;
     force = forces;
@@ -706,8 +699,6 @@ double VRattleDynamics::step(double maxStep) {
 }
 
 bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
-    if (!isFinite(forces))
-        throw StepFailure("the force on a particle became infinite or not a number at the end of the step");
     const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
     vector<double> backValues;
     const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
@@ -834,12 +825,44 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const 
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].reference == 0)
             monitor.setReference((int) k, startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
-    if (areAllTaken || firstDensity > 0)
+    if (areAllTaken) {
+        if (hasBack)
+            scaleReferences(startValues, backValues);
+        return true;
+    }
+    if (firstDensity > 0)
         return true;
     const double back = hasBack ? combineAndLimit(backValues) : 0.0;
     firstDensity =
         startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
     return std::fabs(firstDensity - rhoNext) <= 1e-12 * rhoNext;
+}
+
+// With rho[1/2] = 1 the steps to either side have the size h, and not h/u0, so that the change of u over a step of the
+// sequence is theirs over u0. Scale the references such that u0 + (u1 - u-1)/(4 u0) = 1.
+void VRattleDynamics::scaleReferences(const vector<double>& startValues, const vector<double>& backValues) {
+    vector<double> references;
+    for (const StepMonitor::Term& term : monitor.getTerms())
+        references.push_back(term.reference);
+    auto mismatchOf = [&](double scale) {
+        for (size_t k = 0; k < references.size(); k++)
+            monitor.setReference((int) k, scale * references[k]);
+        const double start = combineAndLimit(startValues);
+        return start + 0.25 * (combineAndLimit(valuesNext) - combineAndLimit(backValues)) / start - 1;
+    };
+    double last = 1, scale = 1.001, lastMismatch = mismatchOf(last);
+    for (int iteration = 0; iteration < 20; iteration++) { // the secant method
+        const double mismatch = mismatchOf(scale);
+        const double next = scale - mismatch * (scale - last) / (mismatch - lastMismatch);
+        if (std::fabs(mismatch) < 1e-14 || !(next > 0.5 && next < 2))
+            break;
+        last = scale;
+        lastMismatch = mismatch;
+        scale = next;
+    }
+    // Where the monitor is not resolved the scale is left alone.
+    if (!(std::fabs(mismatchOf(scale)) < 1e-6))
+        mismatchOf(1);
 }
 
 // The smooth sequence's value half a step after the start, from the values at the start, one step ahead and one back.

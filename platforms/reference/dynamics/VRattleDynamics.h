@@ -206,6 +206,7 @@ private:
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
     std::vector<double> evaluateHalfSteps();
     bool startDensityFrom(const std::vector<double>& startValues, const std::vector<double>& backValues, bool hasBack);
+    void scaleReferences(const std::vector<double>& startValues, const std::vector<double>& backValues);
     static double startValue(double start, double ahead, const double* back);
 
     ConstraintSystem system;

@@ -2,13 +2,33 @@
 // SPDX-License-Identifier: MIT
 
 #include "ReferenceVRattleKernels.h"
+#include "openmm/CMAPTorsionForce.h"
+#include "openmm/CustomAngleForce.h"
+#include "openmm/CustomBondForce.h"
+#include "openmm/CustomCentroidBondForce.h"
+#include "openmm/CustomCompoundBondForce.h"
+#include "openmm/CustomExternalForce.h"
+#include "openmm/CustomGBForce.h"
+#include "openmm/CustomHbondForce.h"
+#include "openmm/CustomManyParticleForce.h"
+#include "openmm/CustomNonbondedForce.h"
+#include "openmm/CustomTorsionForce.h"
+#include "openmm/GBSAOBCForce.h"
+#include "openmm/GayBerneForce.h"
+#include "openmm/HarmonicAngleForce.h"
+#include "openmm/HarmonicBondForce.h"
+#include "openmm/NonbondedForce.h"
 #include "openmm/OpenMMException.h"
+#include "openmm/PeriodicTorsionForce.h"
+#include "openmm/RBTorsionForce.h"
 #include "openmm/internal/ContextImpl.h"
 #include "openmmvrattle/Fingerprint.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <set>
 #include <sstream>
+#include <typeindex>
 
 using namespace OpenMMVRattle;
 using OpenMM::ContextImpl;
@@ -40,6 +60,22 @@ void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, co
                                       std::to_string(i) + " is not a finite number; set it before stepping");
 }
 
+// Whether a Force may change positions or velocities before a step (ForceImpl::updateContextState). Of OpenMM's own Forces that
+// are mere functions of the positions we know that they do not; of all others we do not.
+bool mayChangeState(const OpenMM::Force& force) {
+    static const std::set<std::type_index> harmless = {
+        typeid(OpenMM::CMAPTorsionForce),       typeid(OpenMM::CustomAngleForce),
+        typeid(OpenMM::CustomBondForce),        typeid(OpenMM::CustomCentroidBondForce),
+        typeid(OpenMM::CustomCompoundBondForce), typeid(OpenMM::CustomExternalForce),
+        typeid(OpenMM::CustomGBForce),          typeid(OpenMM::CustomHbondForce),
+        typeid(OpenMM::CustomManyParticleForce), typeid(OpenMM::CustomNonbondedForce),
+        typeid(OpenMM::CustomTorsionForce),     typeid(OpenMM::GBSAOBCForce),
+        typeid(OpenMM::GayBerneForce),          typeid(OpenMM::HarmonicAngleForce),
+        typeid(OpenMM::HarmonicBondForce),      typeid(OpenMM::NonbondedForce),
+        typeid(OpenMM::PeriodicTorsionForce),   typeid(OpenMM::RBTorsionForce)};
+    return harmless.count(typeid(force)) == 0;
+}
+
 // Whether two sets of forces are the same but for rounding; a particle in equilibrium is measured by the others.
 bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
     double meanSquare = 0;
@@ -68,6 +104,10 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
             throw OpenMMException("VariableStepRattleIntegrator: constraint " + std::to_string(i) +
                                   " of the System has a length that is not a positive finite number");
     }
+    hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
+    mayForcesChangeState = false;
+    for (int i = 0; i < system.getNumForces(); i++)
+        mayForcesChangeState = mayForcesChangeState || mayChangeState(system.getForce(i));
     systemFingerprint = VRattleRunState::fingerprintOf(system);
     dynamics.reset(new VRattleDynamics(masses, constraints));
     isContextAhead = false;
@@ -135,17 +175,19 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
         isStateChanged = true;
     }
     forcesInvalid |= haveBoxVectorsChanged();
+    // What the user changes we are told; a look at all positions and velocities is spent only where it may find something.
+    const bool mustCompare = mayForcesChangeState || isContextAhead;
     try {
         if (isStateChanged)
             startAfresh(context);
-        else if (forcesInvalid || differ(*data.positions, knownPositions())) {
+        else if (forcesInvalid || (mustCompare && differ(*data.positions, knownPositions()))) {
             // A Force has changed the state (a barostat, say).
             isStateChanged = true;
             noteContext();
             double energy = computeForces(context);
             dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
         }
-        else if (differ(*data.velocities, knownVelocities())) {
+        else if (mustCompare && differ(*data.velocities, knownVelocities())) {
             noteContext();
             dynamics->changeVelocities(*data.velocities);
         }
@@ -220,6 +262,10 @@ bool ReferenceIntegrateVRattleStepKernel::differ(const vector<Vec3>& a, const ve
 }
 
 void ReferenceIntegrateVRattleStepKernel::writeMoving(const vector<Vec3>& from, vector<Vec3>& to) const {
+    if (!hasMassless) {
+        to = from;
+        return;
+    }
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0)
             to[i] = from[i];
