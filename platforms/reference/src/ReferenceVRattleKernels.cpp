@@ -116,6 +116,7 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
     areSettingsChanged = isStateChanged = true;
     restored.reset();
     lastDensity = 1;
+    lastStepCount = -1;
     numForceEvaluations = 0;
     readSettings(integrator);
 }
@@ -175,8 +176,9 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
         isStateChanged = true;
     }
     forcesInvalid |= haveBoxVectorsChanged();
-    // What the user changes we are told; a look at all positions and velocities is spent only where it may find something.
-    const bool mustCompare = mayForcesChangeState || isContextAhead;
+    // What the user changes we are told; a look at all positions and velocities is spent only where it may find something: where a
+    // Force may have changed them, or another integrator (CompoundIntegrator) has taken steps.
+    const bool mustCompare = mayForcesChangeState || isContextAhead || data.stepCount != lastStepCount;
     try {
         if (isStateChanged)
             startAfresh(context);
@@ -310,7 +312,7 @@ double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context,
     isContextAhead = false;
     lastDensity = dynamics->getDensity();
     data.time = size < maxStep ? data.time + size : maxTime;
-    data.stepCount++;
+    lastStepCount = ++data.stepCount;
     return size;
 }
 

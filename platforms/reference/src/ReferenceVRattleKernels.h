@@ -81,7 +81,7 @@ private:
     std::unique_ptr<VRattleRunState> restored;
     VRattleDynamics::Memory restoredMemory;
     double lastDensity;
-    long long numForceEvaluations;
+    long long numForceEvaluations, lastStepCount;
 };
 
 } // namespace OpenMMVRattle
