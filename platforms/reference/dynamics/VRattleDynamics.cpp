@@ -50,7 +50,7 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
     for (vector<double>* numbers :
          {&lambda, &rightSide, &multiplierOffset, &appliedTerm, &lambdaNext, &rightSideNext, &appliedTermNext,
           &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction, &coupling,
-          &response, &lambdaBack, &rightSideBack})
+          &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(numConstraints);
@@ -245,10 +245,10 @@ double VRattleDynamics::evaluateRate() {
         for (int i : movingParticles)
             acceleration[i] = monitor.getForces()[i] * inverseMasses[i];
         system.evaluateJacobian(qNext, velocityJacobian);
-        system.addTransposedOverMass(velocityJacobian, lambdaNext, -1.0, acceleration);
+        system.addTransposedOverMass(velocityJacobian, lambdaOnStep, -1.0, acceleration);
     }
     return density.limitDerivative(monitor.combine(valuesNext)) *
-           monitor.evaluateRate(vNext, lambdaNext, rightSideNext, valuesNext, acceleration, lambdaRate);
+           monitor.evaluateRate(vNext, lambdaOnStep, rightSideNext, valuesNext, acceleration, lambdaRate);
 }
 
 bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
@@ -703,12 +703,14 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     vector<double> backValues;
     const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
     const vector<double> startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
-    if (stepKind == Regular)
-        keepOffsets();
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
-    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaNext, rightSideNext, valuesNext, withHalfStep);
+    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
+                   withHalfStep);
     if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
+    // From here on nothing fails.
+    if (stepKind == Regular)
+        keepOffsets();
     hasHalfStepValue = withHalfStep;
     if (withHalfStep) {
         halfStepValue = combineAndLimit(valuesHalf);
@@ -720,7 +722,7 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     w.swap(wNext);
     force = forces;
     groupEnergy = energy;
-    lambda.swap(lambdaNext);
+    lambda.swap(lambdaOnStep);
     rightSide.swap(rightSideNext);
     values.swap(valuesNext);
     jacobian.swap(jacobianNext);

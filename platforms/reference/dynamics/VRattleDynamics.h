@@ -237,7 +237,7 @@ private:
     StepKind stepKind;
     std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
     double rhoNext, stepNext, kickNext, halfStepValueNext, rateNext;
-    std::vector<double> lambdaNext, rightSideNext, valuesNext, appliedTermNext;
+    std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext, appliedTermNext;
     std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
     std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
     ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
