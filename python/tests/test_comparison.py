@@ -193,6 +193,29 @@ def test_interrupt_keeps_what_was_done():
     assert verdict(result)[-1] == "The comparison was interrupted and is not complete."
 
 
+def test_steps_that_are_too_large_to_start_with_are_made_smaller():
+    """With 16 fs at the start a whip cannot be passed; the run that is compared has small enough steps."""
+    test_system = SYSTEMS["double-pendulum"]()
+    blind = StepControl(monitors=(MonitorSettings("VectorField"),), nominal_step_size=0.016)
+    settings = replace(test_system.settings, total_time=2.0, force_evaluations=8000, controls=(blind,))
+    run = compare(test_system, settings=settings).run_of("vrattle")
+    assert run.parameter < 0.001
+    assert run.force_evaluations == pytest.approx(8000, rel=0.02)
+
+
+def test_calibration_counts_as_force_evaluations():
+    test_system = SYSTEMS["light-heavy-chain"]()
+    first_value = test_system.settings.controls[0]
+    controls = (first_value, replace(first_value, calibration_steps=200))
+    settings = replace(test_system.settings, total_time=2.0, force_evaluations=1600, controls=controls)
+    runs = compare(test_system, settings=settings).runs[-2:]
+    assert runs[1].steps == pytest.approx(1400, rel=0.03)
+    assert runs[0].steps == pytest.approx(1600, rel=0.02)
+    assert runs[0].parameter != pytest.approx(runs[1].parameter, rel=0.1)
+    for run in runs:
+        assert run.force_evaluations == pytest.approx(1600, rel=0.02)
+
+
 def test_progress_reaches_its_end():
     test_system = SYSTEMS["rigid-waters"]()
     reports = []
