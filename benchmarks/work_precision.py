@@ -675,7 +675,7 @@ def _saved_in_words(saved: tuple[float, bool] | None) -> str:
 def _bounds_in_words(measurement: Measurement) -> str:
     smallest, largest = measurement.smallest_step_ratio, measurement.largest_step_ratio
     words = [
-        f"smallest step 1/{1 / smallest:,.3g}" if smallest else "no smallest step",
+        f"smallest step 1/{1 / smallest:,.0f}" if smallest else "no smallest step",
         f"largest {largest:.3g} times the nominal" if largest else "no largest step",
     ]
     return ", ".join(words)
