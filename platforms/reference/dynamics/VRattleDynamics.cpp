@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "VRattleDynamics.h"
+#include "Pack.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -14,6 +15,9 @@ using std::vector;
 namespace {
 
 const int MAX_CHORD_ITERATIONS = 12, MAX_NEWTON_ITERATIONS = 50;
+// Threads share the batches from this number of constraints on: a call of the thread pool costs about 6 us, and a pass 15 ns
+// a constraint.
+const int MIN_PARALLEL_CONSTRAINTS = 3000;
 // If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
 const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 // The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
@@ -25,6 +29,11 @@ const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
+
+// The larger of two numbers, or a NaN if one is.
+double larger(double a, double b) {
+    return a >= b || std::isnan(a) ? a : b;
+}
 
 double dot(const vector<double>& a, const vector<double>& b) {
     double sum = 0;
@@ -54,6 +63,11 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
         numbers->resize(numConstraints);
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(numConstraints);
+}
+
+void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
+    parallel = numThreads > 1 ? newParallel : Parallel();
+    threadResults.resize(numThreads);
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
@@ -177,13 +191,9 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                  multipliers.data(),   rightSides.data(),
                                  withHalfStep ? lambdaHalf.data() : nullptr, rightSideHalf.data(),
                                  lambdaRate.data(),    kick};
-    double pivot = std::numeric_limits<double>::infinity();
-    for (const auto& batch : system.getBatches()) {
-        const double smallest = batch->finish(arrays, 0, batch->getSize());
-        if (smallest < pivot || std::isnan(smallest))
-            pivot = smallest;
-    }
-    if (!(pivot > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
+    const BatchResult pivots = runBatches(
+        false, [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.finish(arrays, begin, end); });
+    if (!(pivots.extreme > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
         // The general way knows how to name the cluster.
         system.evaluateJacobian(positions, jacobianNext);
         matrix.factorize(jacobianNext);
@@ -374,6 +384,35 @@ void VRattleDynamics::formHalfStepVelocities() {
 
 // ------------------------------------------------------------------------------------------ the equations of a step
 
+// Run a task on all batches: task(batch, first cluster, end, iterations). Each thread takes one piece of every batch, which begins
+// at a whole pack, so that every cluster is worked on in the same lane whatever the number of threads.
+template <class Task> VRattleDynamics::BatchResult VRattleDynamics::runBatches(bool largest, const Task& task) {
+    auto runShare = [&](int thread, int numThreads) {
+        BatchResult result = {largest ? 0.0 : std::numeric_limits<double>::infinity(), 0};
+        for (const auto& batch : system.getBatches()) {
+            const int numPacks = (batch->getSize() + PACK_SIZE - 1) / PACK_SIZE;
+            const int begin = PACK_SIZE * (int) ((long long) numPacks * thread / numThreads);
+            const int end =
+                std::min(batch->getSize(), PACK_SIZE * (int) ((long long) numPacks * (thread + 1) / numThreads));
+            if (begin < end) {
+                const double number = task(*batch, begin, end, result.iterations);
+                result.extreme = largest ? larger(result.extreme, number) : -larger(-result.extreme, -number);
+            }
+        }
+        return result;
+    };
+    if (!parallel || system.getFirstGeneral() < MIN_PARALLEL_CONSTRAINTS)
+        return runShare(0, 1);
+    const int numThreads = (int) threadResults.size();
+    parallel([&](int thread) { threadResults[thread] = runShare(thread, numThreads); });
+    BatchResult result = threadResults[0];
+    for (const BatchResult& each : threadResults) {
+        result.extreme = largest ? larger(result.extreme, each.extreme) : -larger(-result.extreme, -each.extreme);
+        result.iterations = std::max(result.iterations, each.iterations);
+    }
+    return result;
+}
+
 // Where the iteration starts. Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes
 // that O(h^3).
 void VRattleDynamics::startMultipliers(bool withOffset) {
@@ -422,16 +461,12 @@ bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, dou
     moveFreeParticles(start, kick, drift);
     const StepArrays arrays = stepArrays(start, kick, drift);
     const double tolerance = margin * settings.tolerance;
-    int iterations = 0;
-    lastError = 0;
-    auto keepLargest = [&](double error) {
-        if (error > lastError || std::isnan(error))
-            lastError = error;
-    };
-    for (const auto& batch : system.getBatches())
-        keepLargest(batch->solvePositions(arrays, 0, batch->getSize(), tolerance, iterations));
-    keepLargest(solveGeneral(start, kick, drift, tolerance, iterations));
-    numIterations += iterations;
+    BatchResult result =
+        runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
+            return batch.solvePositions(arrays, begin, end, tolerance, iterations);
+        });
+    lastError = larger(result.extreme, solveGeneral(start, kick, drift, tolerance, result.iterations));
+    numIterations += result.iterations;
     return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
 }
 
@@ -509,14 +544,10 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
         const StepArrays arrays = stepArrays(w, kick, drift);
-        lastError = 0;
-        auto keepLargest = [&](double error) {
-            if (error > lastError || std::isnan(error))
-                lastError = error;
-        };
-        for (const auto& batch : system.getBatches())
-            keepLargest(batch->coupledPass(arrays, 0, batch->getSize()));
-        keepLargest(coupledPassGeneral(kick, drift));
+        const BatchResult result = runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int&) {
+            return batch.coupledPass(arrays, begin, end);
+        });
+        lastError = larger(result.extreme, coupledPassGeneral(kick, drift));
         moveFreeParticles(w, kick, drift);
         monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
         const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;

@@ -12,6 +12,7 @@
 #include "StepFailure.h"
 #include "StepMonitor.h"
 #include "openmm/Vec3.h"
+#include <functional>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -58,6 +59,14 @@ public:
     };
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+
+    /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
+    typedef std::function<void(const std::function<void(int)>&)> Parallel;
+    /**
+     * Let threads share the batches of small clusters where these are many enough to pay for it. Results do not depend on
+     * the number of threads, to the last bit.
+     */
+    void setParallel(const Parallel& parallel, int numThreads);
 
     /**
      * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
@@ -187,6 +196,13 @@ private:
                                std::vector<double>& rightSides);
     double evaluateRate();
 
+    /** What a task on the batches gives: the extreme of its numbers over the clusters (a NaN counts), and iterations. */
+    struct BatchResult {
+        double extreme;
+        int iterations;
+    };
+    template <class Task> BatchResult runBatches(bool largest, const Task& task);
+
     StepArrays stepArrays(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     void startMultipliers(bool withOffset);
     void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift,
@@ -216,6 +232,8 @@ private:
     StepDensity density;
     Settings settings;
     std::vector<int> movingParticles;
+    Parallel parallel; // empty: one thread
+    std::vector<BatchResult> threadResults;
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;

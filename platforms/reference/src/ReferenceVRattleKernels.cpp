@@ -110,6 +110,13 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
         mayForcesChangeState = mayForcesChangeState || mayChangeState(system.getForce(i));
     systemFingerprint = VRattleRunState::fingerprintOf(system);
     dynamics.reset(new VRattleDynamics(masses, constraints));
+    if (getPlatform().getName() != "Reference") { // which does everything on one thread
+        auto runOnThreads = [this](const std::function<void(int)>& task) {
+            data.threads.execute([&task](OpenMM::ThreadPool&, int thread) { task(thread); });
+            data.threads.waitForThreads();
+        };
+        dynamics->setParallel(runOnThreads, data.threads.getNumThreads());
+    }
     isContextAhead = false;
     forceGroups = 0;
     monitorForceGroup = NO_MONITOR_GROUP;
