@@ -35,8 +35,9 @@ public:
     }
     /** rho[n+1/2] of the update Bounded: f(rho[n+1/2]) + f(rho[n-1/2]) = 2 f(u); always larger than nominal/maximum. */
     double boundedUpdate(double u, double previous) const;
-    Update getUpdate() const {
-        return update;
+    /** Whether a density asks for a step of more than twice the maximum. */
+    bool isFarBelowBound(double rho) const {
+        return rho < 0.5 * smallest;
     }
 
 private:

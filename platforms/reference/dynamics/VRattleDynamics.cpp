@@ -498,7 +498,14 @@ double VRattleDynamics::solveGeneral(const vector<Vec3>& start, double kick, dou
 // The same for all constraints with Newton's iteration: G(q+) M^-1 G(q)^T in place of K. Where the chord iteration fails.
 bool VRattleDynamics::solvePositionsByNewton(const vector<Vec3>& start, double kick, double drift) {
     ensureFactor(FullFactor);
+    // From where the chord iteration has come to, and if that was too far off, from Lambda.
+    if (iterateNewton(start, kick, drift))
+        return true;
     startMultipliers(false);
+    return iterateNewton(start, kick, drift);
+}
+
+bool VRattleDynamics::iterateNewton(const vector<Vec3>& start, double kick, double drift) {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         computeTrial(start, kick, drift, movingParticles, 0);
@@ -654,27 +661,34 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
 
 // Solve for rho+, lambda, w+ and q+ of a regular step; returns its size.
 double VRattleDynamics::solveRegular() {
-    bool isRescue = false;
-    if (settings.isFixedStep || monitor.isEmpty())
-        rhoNext = 1;
+    const double h = settings.stepSize;
+    auto solveWith = [&](double next) {
+        rhoNext = next;
+        return solvePositions(w, 0.5 * (h / rho + h / rhoNext), h / rhoNext, REGULAR_MARGIN);
+    };
+    const bool isFixed = settings.isFixedStep || monitor.isEmpty();
+    bool isSolved;
+    if (isFixed)
+        isSolved = solveWith(1);
     else if (settings.update == StepDensity::Bounded)
-        rhoNext = density.boundedUpdate(u, rho);
-    else if (needsHalfStepValue()) {
-        if (solveCoupled() == Converged || solveCoupledByNewton() == Converged)
-            return settings.stepSize / rhoNext;
-        isRescue = true;
-    }
+        isSolved = solveWith(density.boundedUpdate(u, rho));
+    else if (needsHalfStepValue())
+        isSolved = solveCoupled() == Converged || solveCoupledByNewton() == Converged;
     else {
-        rhoNext = StepDensity::sumUpdate(u, rho);
-        isRescue = !(rhoNext > 0);
+        const double next = StepDensity::sumUpdate(u, rho);
+        isSolved = next > 0 && solveWith(next);
     }
-    if (isRescue)
-        rhoNext = density.boundedUpdate(u, rho);
-    const double drift = settings.stepSize / rhoNext;
-    if (!solvePositions(w, 0.5 * (settings.stepSize / rho + drift), drift, REGULAR_MARGIN))
-        throwNotConverged();
-    numRescues += isRescue;
-    return drift;
+    if (isFixed || settings.update == StepDensity::Bounded) {
+        if (!isSolved)
+            throwNotConverged();
+    }
+    else if (!isSolved || density.isFarBelowBound(rhoNext)) {
+        // A rescue: the sum gave no step, or one far above the maximum.
+        if (!solveWith(density.boundedUpdate(u, rho)))
+            throwNotConverged();
+        numRescues++;
+    }
+    return h / rhoNext;
 }
 
 void VRattleDynamics::throwNotConverged() const {

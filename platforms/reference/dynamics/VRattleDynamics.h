@@ -212,6 +212,7 @@ private:
     double solveGeneral(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double tolerance,
                         int& iterations);
     bool solvePositionsByNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    bool iterateNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     SolveResult solveCoupled();
     double coupledPassGeneral(double kick, double drift);
     SolveResult solveCoupledByNewton();
