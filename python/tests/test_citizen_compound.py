@@ -173,3 +173,21 @@ def test_force_groups_and_temperature_of_a_compound() -> None:
     alone.step(50)
     assert np.array_equal(positions_of(context), positions_of(other))
     assert ours.getIntegrationForceGroups() == 1
+
+
+def test_steps_of_another_integrator_are_noticed_whatever_the_step_count(platform: str) -> None:
+    """The user may set the step count back to what it was before the other integrator took its steps."""
+    model = chain()
+    compound = openmm.CompoundIntegrator()
+    compound.addIntegrator(make_integrator())
+    compound.addIntegrator(openmm.VerletIntegrator(0.0005))
+    context = open_context(model.system(), compound, platform, model)
+    compound.step(40)
+    compound.setCurrentIntegrator(1)
+    compound.step(40)
+    context.setStepCount(40)
+    compound.setCurrentIntegrator(0)
+    before = positions_of(context)
+    compound.step(1)
+    # A step moves particles by about 1e-3 nm; from the positions before the other's steps it is fifty times as far.
+    assert np.max(np.abs(positions_of(context) - before)) < 5e-3

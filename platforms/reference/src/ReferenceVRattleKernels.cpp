@@ -123,7 +123,6 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
     areSettingsChanged = isStateChanged = true;
     restored.reset();
     lastDensity = 1;
-    lastStepCount = -1;
     numForceEvaluations = 0;
     readSettings(integrator);
 }
@@ -182,10 +181,12 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
         forceGroups = groups;
         isStateChanged = true;
     }
-    forcesInvalid |= haveBoxVectorsChanged();
+    // A barostat says that the forces are invalid; a new box without a word of that is the user's.
+    if (haveBoxVectorsChanged() && !forcesInvalid)
+        isStateChanged = true;
     // What the user changes we are told; a look at all positions and velocities is spent only where it may find something: where a
-    // Force may have changed them, or another integrator (CompoundIntegrator) has taken steps.
-    const bool mustCompare = mayForcesChangeState || isContextAhead || data.stepCount != lastStepCount;
+    // Force may have changed them, or another integrator (of a CompoundIntegrator) may have taken steps.
+    const bool mustCompare = mayForcesChangeState || isContextAhead || &context.getIntegrator() != &integrator;
     try {
         if (isStateChanged)
             startAfresh(context);
@@ -319,7 +320,7 @@ double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context,
     isContextAhead = false;
     lastDensity = dynamics->getDensity();
     data.time = size < maxStep ? data.time + size : maxTime;
-    lastStepCount = ++data.stepCount;
+    data.stepCount++;
     return size;
 }
 

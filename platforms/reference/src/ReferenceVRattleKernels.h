@@ -81,7 +81,7 @@ private:
     std::unique_ptr<VRattleRunState> restored;
     VRattleDynamics::Memory restoredMemory;
     double lastDensity;
-    long long numForceEvaluations, lastStepCount;
+    long long numForceEvaluations;
 };
 
 } // namespace OpenMMVRattle

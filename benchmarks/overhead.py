@@ -1,0 +1,143 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""What a step of VariableStepRattleIntegrator costs beside a step of VerletIntegrator, on real systems.
+
+The integrators take turns, a few steps each, so that whatever else the machine does hits them alike; the cost is the
+ratio of neighbouring turns, its median and the range of its middle half. A table and one JSON line a ratio are printed.
+
+    python benchmarks/overhead.py [--system water-6000 ...] [--platform CPU] [--rounds 15]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+
+import openmm
+import rich.console
+import rich.table
+from openmm import app, unit
+from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.testsystems import alanine_dipeptide
+
+STEP = 0.001  # ps
+
+
+def water(box: float) -> tuple[openmm.System, list]:
+    """A cube of TIP3P water with PME; the length of its edge is in nm."""
+    field = app.ForceField("amber14/tip3p.xml")
+    modeller = app.Modeller(app.Topology(), [])
+    modeller.addSolvent(field, boxSize=openmm.Vec3(box, box, box) * unit.nanometer)
+    system = field.createSystem(modeller.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9, rigidWater=True)
+    return system, modeller.positions
+
+
+def peptide() -> tuple[openmm.System, list]:
+    """Alanine dipeptide with bonds to hydrogen fixed, in a box of TIP3P water with PME."""
+    molecule = alanine_dipeptide(constraints=app.HBonds)
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    modeller = app.Modeller(molecule.topology, molecule.positions * unit.nanometer)
+    modeller.addSolvent(field, padding=0.8 * unit.nanometer)
+    system = field.createSystem(
+        modeller.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9, constraints=app.HBonds, rigidWater=True
+    )
+    return system, modeller.positions
+
+
+SYSTEMS: dict[str, Callable[[], tuple[openmm.System, list]]] = {
+    "water-6000": lambda: water(3.94),
+    "water-24000": lambda: water(6.25),
+    "peptide-in-water": peptide,
+}
+
+
+def integrators() -> dict[str, openmm.Integrator]:
+    """Verlet at the tolerance of 1e-6 that OpenMM's examples take, ours at its default of 1e-8, with the default monitor."""
+    verlet = openmm.VerletIntegrator(STEP)
+    verlet.setConstraintTolerance(1e-6)
+    explicit = VariableStepRattleIntegrator(STEP)
+    explicit.setUpdateMethod(VariableStepRattleIntegrator.Explicit)
+    return {"Verlet": verlet, "Explicit": explicit, "SemiExplicit": VariableStepRattleIntegrator(STEP)}
+
+
+def measure(name: str, platform: str, rounds: int, steps: int, threads: int | None) -> list[dict]:
+    """The steps per second of each integrator, and the ratio of its cost to VerletIntegrator's."""
+    system, positions = SYSTEMS[name]()
+    properties = {"Threads": str(threads)} if threads and platform == "CPU" else {}
+    start = None
+    runs = integrators()
+    contexts = {}
+    for label, integrator in runs.items():
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+        if start is None:
+            # One relaxed state for all: no clashes, and velocities of 300 K.
+            context.setPositions(positions)
+            openmm.LocalEnergyMinimizer.minimize(context, 50, 60)
+            context.setVelocitiesToTemperature(300, 1)
+            start = context.getState(positions=True, velocities=True)
+        context.setPositions(start.getPositions())
+        context.setVelocities(start.getVelocities())
+        integrator.step(steps)
+        contexts[label] = context
+    seconds: dict[str, list[float]] = {label: [] for label in runs}
+    for turn in range(rounds):
+        labels = list(runs)
+        for label in labels[turn % len(labels) :] + labels[: turn % len(labels)]:
+            begin = time.perf_counter()
+            runs[label].step(steps)
+            contexts[label].getState(energy=False)
+            seconds[label].append((time.perf_counter() - begin) / steps)
+    results = []
+    for label in runs:
+        ratios = sorted(a / b for a, b in zip(seconds[label], seconds["Verlet"], strict=True))
+        result = {
+            "benchmark": "overhead",
+            "system": name,
+            "atoms": system.getNumParticles(),
+            "constraints": system.getNumConstraints(),
+            "platform": platform,
+            "integrator": label,
+            "steps_per_second": 1 / statistics.median(seconds[label]),
+            "ratio": statistics.median(ratios),
+            "ratio_of_best": min(seconds[label]) / min(seconds["Verlet"]),
+            "ratio_quarter": ratios[len(ratios) // 4],
+            "ratio_three_quarters": ratios[-1 - len(ratios) // 4],
+        }
+        if label != "Verlet":
+            result["solver_iterations_per_step"] = runs[label].getNumSolverIterations() / (steps * (rounds + 1))
+        results.append(result)
+    return results
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
+    parser.add_argument("--platform", default="CPU")
+    parser.add_argument("--threads", type=int, help="threads of the CPU platform (default: OpenMM's choice)")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--steps", type=int, default=10, help="steps in a turn")
+    arguments = parser.parse_args()
+    table = rich.table.Table(title="Cost of a step beside VerletIntegrator's")
+    for column in ("system", "atoms", "integrator", "steps/s", "ratio", "middle half", "best/best"):
+        table.add_column(column)
+    for name in arguments.system:
+        for result in measure(name, arguments.platform, arguments.rounds, arguments.steps, arguments.threads):
+            print(json.dumps(result), flush=True)
+            table.add_row(
+                name,
+                str(result["atoms"]),
+                result["integrator"],
+                f"{result['steps_per_second']:.1f}",
+                f"{result['ratio']:.3f}",
+                f"{result['ratio_quarter']:.3f} to {result['ratio_three_quarters']:.3f}",
+                f"{result['ratio_of_best']:.3f}",
+            )
+    rich.console.Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
