@@ -40,7 +40,7 @@ def peptide() -> tuple[openmm.System, list]:
     molecule = alanine_dipeptide(constraints=app.HBonds)
     field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
     modeller = app.Modeller(molecule.topology, molecule.positions * unit.nanometer)
-    modeller.addSolvent(field, padding=0.8 * unit.nanometer)
+    modeller.addSolvent(field, boxSize=openmm.Vec3(3, 3, 3) * unit.nanometer)
     system = field.createSystem(
         modeller.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9, constraints=app.HBonds, rigidWater=True
     )
@@ -55,7 +55,7 @@ SYSTEMS: dict[str, Callable[[], tuple[openmm.System, list]]] = {
 
 
 def integrators() -> dict[str, openmm.Integrator]:
-    """Verlet at the tolerance of 1e-6 that OpenMM's examples take, ours at its default of 1e-8, with the default monitor."""
+    """Verlet at the tolerance 1e-6 of OpenMM's examples, ours at its default of 1e-8, with the default monitor."""
     verlet = openmm.VerletIntegrator(STEP)
     verlet.setConstraintTolerance(1e-6)
     explicit = VariableStepRattleIntegrator(STEP)

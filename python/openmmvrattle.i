@@ -694,9 +694,10 @@ def getNumSolverIterations(self) -> int:
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumRescues %{
 def getNumRescues(self) -> int:
     r"""
-    Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, or was not
-    solvable together with the constraints, and the density of the update Bounded was taken for that one step. The run goes
-    on, but it is not exactly reversible across a rescued step.
+    Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, a
+    step of more than twice the maximum, or equations that could not be solved, and the density of the update Bounded was
+    taken for that one step. The run goes on, but it is not exactly reversible across a rescued step. A number that grows
+    says that the nominal step size is too large.
 
     Returns
     -------

@@ -118,7 +118,8 @@ public:
     double getMinimumStepSize() const;
     /**
      * Set the smallest step size the monitor can ask for. With the sum updates SemiExplicit and Explicit, rho
-     * oscillates slightly about u and steps may leave the bounds by as much. Default: 1/50 of the nominal step size.
+     * oscillates slightly about u and steps may leave the bounds by as much; where the motion is not resolved they may
+     * leave them by more. Default: 1/50 of the nominal step size.
      *
      * @param size    the bound in ps, smaller than the nominal step size; 0 means no bound
      */
@@ -126,8 +127,9 @@ public:
     /** Get the largest step size the monitor can ask for (in ps), or 0 if there is no bound. */
     double getMaximumStepSize() const;
     /**
-     * Set the largest step size the monitor can ask for; see setMinimumStepSize(). With the update Bounded no step is ever larger.
-     * Default: twice the nominal step size.
+     * Set the largest step size the monitor can ask for; see setMinimumStepSize(). With the update Bounded no step is ever
+     * larger, with the others a step of more than twice the bound is rescued (see getNumRescues()). Default: twice the
+     * nominal step size.
      *
      * @param size    the bound in ps, larger than the nominal step size; 0 means no bound
      */
@@ -228,9 +230,10 @@ public:
     /** Get how many iterations the solver of the constraints has taken since the Context was created. */
     long long getNumSolverIterations() const;
     /**
-     * Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, or
-     * was not solvable together with the constraints, and the density of the update Bounded was taken for that one
-     * step. The run goes on, but it is not exactly reversible across a rescued step.
+     * Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, a
+     * step of more than twice the maximum, or equations that could not be solved, and the density of the update Bounded
+     * was taken for that one step. The run goes on, but it is not exactly reversible across a rescued step. A number that
+     * grows says that the nominal step size is too large.
      */
     long long getNumRescues() const;
     /**

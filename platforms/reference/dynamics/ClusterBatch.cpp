@@ -89,8 +89,7 @@ public:
     int getSize() const override {
         return numClusters;
     }
-    double solvePositions(const StepArrays& step, int first, int end, double tolerance,
-                          int& iterations) const override;
+    double solvePositions(const StepArrays& step, int first, int end, double tolerance, int& iterations) const override;
     double coupledPass(const StepArrays& step, int first, int end) const override;
     double finish(const OnStepArrays& step, int first, int end) const override;
 
@@ -181,8 +180,7 @@ template <class Topology> void BatchOf<Topology>::factorize(const PackVector* r,
     }
 }
 
-template <class Topology>
-void BatchOf<Topology>::keepSmallestPivot(const Factor& factor, double& smallest) const {
+template <class Topology> void BatchOf<Topology>::keepSmallestPivot(const Factor& factor, double& smallest) const {
     for (int k = 0; k < B; k++) {
         Pack inverse = factor.inversePivot[k] * massCoupling[k][k] * dot(factor.row[k], factor.row[k]);
         for (int lane = 0; lane < PACK_SIZE; lane++) {
@@ -281,8 +279,7 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
     return worst;
 }
 
-template <class Topology>
-double BatchOf<Topology>::coupledPass(const StepArrays& step, int first, int end) const {
+template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays& step, int first, int end) const {
     const Pack kick = packOf(step.kick), drift = packOf(step.drift), inverseDrift = packOf(1 / step.drift);
     const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
     double worst = 0;
@@ -312,8 +309,8 @@ double BatchOf<Topology>::coupledPass(const StepArrays& step, int first, int end
         // Lambda(q, p+) = K^-1 (g''(w+,w+) + G M^-1 F)
         for (int k = 0; k < B; k++) {
             const PackVector velocity = (next[k] - r[k]) * inverseDrift;
-            multipliers[k] = dot(velocity, velocity) * inverseSquareLength[k] +
-                             dot(factor.row[k], bondOf(acceleration, k));
+            multipliers[k] =
+                dot(velocity, velocity) * inverseSquareLength[k] + dot(factor.row[k], bondOf(acceleration, k));
             store(lanes, k, multipliers[k], step.rightSidePlus);
         }
         solve(factor, multipliers);

@@ -17,29 +17,29 @@ namespace OpenMMVRattle {
  */
 struct StepArrays {
     const OpenMM::Vec3* q;      // q[n]
-    const OpenMM::Vec3* start;  // the velocities before the kick: M^-1 p[n-1/2], or v of a step from the on-step state
-    const OpenMM::Vec3* force;  // F(q[n])
-    OpenMM::Vec3* qNext;        // q[n+1]
-    OpenMM::Vec3* wNext;        // M^-1 p[n+1/2]
-    double* lambda;             // the multipliers of the step
-    double* change;             // what the iteration adds to them next
-    double* lambdaPlus;         // Lambda(q[n], p[n+1/2])
-    double* rightSidePlus;      // K times it
-    double kick, drift;         // w+ = start + kick M^-1 (F - G^T lambda), q+ = q + drift w+
+    const OpenMM::Vec3* start; // the velocities before the kick: M^-1 p[n-1/2], or v of a step from the on-step state
+    const OpenMM::Vec3* force; // F(q[n])
+    OpenMM::Vec3* qNext; // q[n+1]
+    OpenMM::Vec3* wNext; // M^-1 p[n+1/2]
+    double* lambda; // the multipliers of the step
+    double* change; // what the iteration adds to them next
+    double* lambdaPlus; // Lambda(q[n], p[n+1/2])
+    double* rightSidePlus; // K times it
+    double kick, drift; // w+ = start + kick M^-1 (F - G^T lambda), q+ = q + drift w+
 };
 
 /** The arrays of the second half of a step, at the new positions. */
 struct OnStepArrays {
-    const OpenMM::Vec3* q;     // q[n+1]
-    const OpenMM::Vec3* w;     // M^-1 p[n+1/2]
+    const OpenMM::Vec3* q; // q[n+1]
+    const OpenMM::Vec3* w; // M^-1 p[n+1/2]
     const OpenMM::Vec3* force; // F(q[n+1])
-    OpenMM::Vec3* v;           // M^-1 p[n+1]
-    double* lambda;            // Lambda(q[n+1], p[n+1])
-    double* rightSide;         // K times it
-    double* lambdaHalf;        // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and then none of the following
-    double* rightSideHalf;     // K times it
-    double* lambdaRate;        // the derivative of Lambda(q[n+1], p) along dp = F - G^T Lambda
-    double kick;               // of (3.12), h/(2 rho)
+    OpenMM::Vec3* v; // M^-1 p[n+1]
+    double* lambda; // Lambda(q[n+1], p[n+1])
+    double* rightSide; // K times it
+    double* lambdaHalf; // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and then none of the following
+    double* rightSideHalf; // K times it
+    double* lambdaRate; // the derivative of Lambda(q[n+1], p) along dp = F - G^T Lambda
+    double kick; // of (3.12), h/(2 rho)
 };
 
 /**

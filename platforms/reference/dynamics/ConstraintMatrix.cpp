@@ -56,8 +56,7 @@ void ConstraintMatrix::factorize(const ConstraintSystem::Jacobian& jacobian, int
     std::fill(values.begin() + numEntries + first, values.end(), 0.0);
     // Two constraints that share both particles have two couplings with one slot, which must add up.
     for (size_t i = first == 0 ? 0 : firstGeneralCoupling; i < couplings.size(); i++)
-        values[couplingSlots[i]] +=
-            couplings[i].factor * jacobian[couplings[i].row].dot(jacobian[couplings[i].column]);
+        values[couplingSlots[i]] += couplings[i].factor * jacobian[couplings[i].row].dot(jacobian[couplings[i].column]);
     double* diagonal = values.data() + numEntries;
     // The diagonal of K, to compare the pivots with, is kept where their inverses will be.
     std::copy(diagonal + first, diagonal + size, inversePivots.begin() + first);

@@ -270,12 +270,14 @@ void ConstraintSystem::evaluateJacobian(const vector<Vec3>& x, Jacobian& jacobia
         jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
 }
 
-void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result, int first) const {
+void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result,
+                                int first) const {
     for (int k = first; k < getNumConstraints(); k++)
         result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]);
 }
 
-void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result, int first) const {
+void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result,
+                                        int first) const {
     for (int k = first; k < getNumConstraints(); k++) {
         int i = constraints[k].particle1, j = constraints[k].particle2;
         result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);

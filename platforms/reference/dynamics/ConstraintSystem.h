@@ -109,8 +109,8 @@ public:
     void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
                   int first = 0) const;
     /** G M^-1 f. */
-    void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f,
-                          std::vector<double>& result, int first = 0) const;
+    void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f, std::vector<double>& result,
+                          int first = 0) const;
     /** result += G^T x, as forces on the particles. */
     void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
     /** result += scale M^-1 G^T x. */

@@ -42,8 +42,8 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 
 StepMonitor::StepMonitor(const ConstraintSystem& system) :
         system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
-        maxForce(0), forcePNorm(0), constraintForceSquared(0), toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
-        velocityJacobian(system.getNumConstraints()) {
+        maxForce(0), forcePNorm(0), constraintForceSquared(0), toSolve(system.getNumConstraints()),
+        solved(system.getNumConstraints()), velocityJacobian(system.getNumConstraints()) {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms, double order) {

@@ -46,20 +46,20 @@ double dot(const vector<double>& a, const vector<double>& b) {
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
         system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), settings(), groupEnergy(0),
-        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0),
-        factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
-        halfStepValueNext(0), rateNext(0), numIterations(0), numRescues(0), lastError(0) {
+        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0),
+        firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0),
+        kickNext(0), halfStepValueNext(0), rateNext(0), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
             movingParticles.push_back(i);
-    for (vector<Vec3>* vectors : {&w, &qNext, &wNext, &vNext, &acceleration, &gradient, &halfStepChange, &qBack, &wBack,
-                                  &vBack, &forceBack})
+    for (vector<Vec3>* vectors :
+         {&w, &qNext, &wNext, &vNext, &acceleration, &gradient, &halfStepChange, &qBack, &wBack, &vBack, &forceBack})
         vectors->resize(numParticles);
     for (vector<double>* numbers :
          {&lambda, &rightSide, &multiplierOffset, &appliedTerm, &lambdaNext, &rightSideNext, &appliedTermNext,
-          &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction, &coupling,
-          &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
+          &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction,
+          &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(numConstraints);
@@ -186,11 +186,16 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                      vector<double>& monitorValues, bool withHalfStep) {
     factorScope = NoFactor;
     isMonitorCurrent = false;
-    const OnStepArrays arrays = {positions.data(),     halfStep.data(),
-                                 forces.data(),        velocities.data(),
-                                 multipliers.data(),   rightSides.data(),
-                                 withHalfStep ? lambdaHalf.data() : nullptr, rightSideHalf.data(),
-                                 lambdaRate.data(),    kick};
+    const OnStepArrays arrays = {positions.data(),
+                                 halfStep.data(),
+                                 forces.data(),
+                                 velocities.data(),
+                                 multipliers.data(),
+                                 rightSides.data(),
+                                 withHalfStep ? lambdaHalf.data() : nullptr,
+                                 rightSideHalf.data(),
+                                 lambdaRate.data(),
+                                 kick};
     const BatchResult pivots = runBatches(
         false, [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.finish(arrays, begin, end); });
     if (!(pivots.extreme > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
@@ -314,7 +319,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
 }
 
 VRattleDynamics::Memory VRattleDynamics::getMemory() const {
-    Memory memory = {hasDensity, rho,    w, multiplierOffset, {}, lambda, values, hasHalfStepValue,
+    Memory memory = {hasDensity, rho,           w,    multiplierOffset, {}, lambda, values, hasHalfStepValue,
                      u,          halfStepValue, rate, densityOffset};
     for (const StepMonitor::Term& term : monitor.getTerms())
         memory.references.push_back(term.reference);
@@ -429,9 +434,9 @@ void VRattleDynamics::keepOffsets() {
 }
 
 StepArrays VRattleDynamics::stepArrays(const vector<Vec3>& start, double kick, double drift) {
-    return {q.data(),          start.data(),      force.data(),           qNext.data(),          wNext.data(),
-            lambdaNext.data(), correction.data(), multiplierTrial.data(), rightSideTrial.data(), kick,
-            drift};
+    return {
+        q.data(),          start.data(),           force.data(),          qNext.data(), wNext.data(), lambdaNext.data(),
+        correction.data(), multiplierTrial.data(), rightSideTrial.data(), kick,         drift};
 }
 
 // acceleration = M^-1 (F - G^T lambda), w+ = start + kick acceleration (3.10), q+ = q + drift w+ (3.9)
@@ -461,10 +466,9 @@ bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, dou
     moveFreeParticles(start, kick, drift);
     const StepArrays arrays = stepArrays(start, kick, drift);
     const double tolerance = margin * settings.tolerance;
-    BatchResult result =
-        runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
-            return batch.solvePositions(arrays, begin, end, tolerance, iterations);
-        });
+    BatchResult result = runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
+        return batch.solvePositions(arrays, begin, end, tolerance, iterations);
+    });
     lastError = larger(result.extreme, solveGeneral(start, kick, drift, tolerance, result.iterations));
     numIterations += result.iterations;
     return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
@@ -611,8 +615,9 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
-        const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
-                                      relativeMismatch / std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING));
+        const double error =
+            std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
+                     relativeMismatch / std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING));
         if (!std::isfinite(error))
             return NotConverged;
         const bool isSlow = error > SLOW_CONVERGENCE * previous;
@@ -871,7 +876,8 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const 
     }
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].reference == 0)
-            monitor.setReference((int) k, startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
+            monitor.setReference((int) k,
+                                 startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
     if (areAllTaken) {
         if (hasBack)
             scaleReferences(startValues, backValues);
@@ -880,8 +886,7 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const 
     if (firstDensity > 0)
         return true;
     const double back = hasBack ? combineAndLimit(backValues) : 0.0;
-    firstDensity =
-        startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
+    firstDensity = startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
     return std::fabs(firstDensity - rhoNext) <= 1e-12 * rhoNext;
 }
 

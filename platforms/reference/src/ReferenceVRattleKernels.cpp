@@ -64,15 +64,15 @@ void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, co
 // are mere functions of the positions we know that they do not; of all others we do not.
 bool mayChangeState(const OpenMM::Force& force) {
     static const std::set<std::type_index> harmless = {
-        typeid(OpenMM::CMAPTorsionForce),       typeid(OpenMM::CustomAngleForce),
-        typeid(OpenMM::CustomBondForce),        typeid(OpenMM::CustomCentroidBondForce),
+        typeid(OpenMM::CMAPTorsionForce),        typeid(OpenMM::CustomAngleForce),
+        typeid(OpenMM::CustomBondForce),         typeid(OpenMM::CustomCentroidBondForce),
         typeid(OpenMM::CustomCompoundBondForce), typeid(OpenMM::CustomExternalForce),
-        typeid(OpenMM::CustomGBForce),          typeid(OpenMM::CustomHbondForce),
+        typeid(OpenMM::CustomGBForce),           typeid(OpenMM::CustomHbondForce),
         typeid(OpenMM::CustomManyParticleForce), typeid(OpenMM::CustomNonbondedForce),
-        typeid(OpenMM::CustomTorsionForce),     typeid(OpenMM::GBSAOBCForce),
-        typeid(OpenMM::GayBerneForce),          typeid(OpenMM::HarmonicAngleForce),
-        typeid(OpenMM::HarmonicBondForce),      typeid(OpenMM::NonbondedForce),
-        typeid(OpenMM::PeriodicTorsionForce),   typeid(OpenMM::RBTorsionForce)};
+        typeid(OpenMM::CustomTorsionForce),      typeid(OpenMM::GBSAOBCForce),
+        typeid(OpenMM::GayBerneForce),           typeid(OpenMM::HarmonicAngleForce),
+        typeid(OpenMM::HarmonicBondForce),       typeid(OpenMM::NonbondedForce),
+        typeid(OpenMM::PeriodicTorsionForce),    typeid(OpenMM::RBTorsionForce)};
     return harmless.count(typeid(force)) == 0;
 }
 
