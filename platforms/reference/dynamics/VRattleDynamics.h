@@ -255,7 +255,7 @@ private:
     // The step in progress.
     StepKind stepKind;
     std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
-    double rhoNext, stepNext, kickNext, halfStepValueNext, rateNext;
+    double rhoNext, stepNext, kickNext;
     std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext, appliedTermNext;
     std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
     std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;

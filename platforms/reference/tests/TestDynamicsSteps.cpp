@@ -1,0 +1,175 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// VRattleDynamics with forces of its own: clusters of every shape that has kernels, in odd and even numbers, beside
+// general ones, against a dense statement of the multipliers; and the same bits with any number of threads.
+
+#include "TestSupport.h"
+#include "VRattleDynamics.h"
+#include <Eigen/Dense>
+#include <cmath>
+#include <random>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+struct Example {
+    vector<double> masses;
+    vector<DistanceConstraint> constraints;
+    vector<Vec3> positions, velocities;
+    std::mt19937 random{5};
+
+    Vec3 randomVector(double scale) {
+        std::normal_distribution<double> normal;
+        return Vec3(normal(random), normal(random), normal(random)) * scale;
+    }
+    // Particles about a place, joined as the pairs say, by constraints as long as their distances happen to be.
+    void addCluster(const vector<double>& clusterMasses, const vector<std::pair<int, int>>& pairs,
+                    const vector<Vec3>& shape) {
+        const int first = (int) masses.size();
+        const Vec3 place = randomVector(2);
+        for (size_t i = 0; i < clusterMasses.size(); i++) {
+            masses.push_back(clusterMasses[i]);
+            positions.push_back(place + shape[i]);
+            velocities.push_back(randomVector(0.5));
+        }
+        for (const auto& pair : pairs) {
+            Vec3 r = shape[pair.first] - shape[pair.second];
+            constraints.push_back({first + pair.first, first + pair.second, std::sqrt(r.dot(r))});
+        }
+    }
+};
+
+static const vector<Vec3> SHAPE = {Vec3(), Vec3(0.1, 0, 0.01), Vec3(-0.03, 0.11, 0), Vec3(-0.02, -0.05, 0.09),
+                                   Vec3(-0.04, -0.05, -0.1)};
+
+static void makeExample(Example& e, int copies) {
+    for (int copy = 0; copy < copies; copy++) {
+        e.addCluster({12, 1}, {{0, 1}}, SHAPE);
+        e.addCluster({1, 16, 2}, {{1, 0}, {1, 2}}, {SHAPE[1], SHAPE[0], SHAPE[2]});
+        e.addCluster({12, 1, 1, 1}, {{0, 1}, {2, 0}, {0, 3}}, SHAPE);
+        e.addCluster({12, 1, 2, 3, 4}, {{0, 1}, {0, 2}, {0, 3}, {4, 0}}, SHAPE);
+        e.addCluster({16, 1, 1}, {{1, 2}, {0, 1}, {2, 0}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
+    }
+    // In no batch: a ring with a tail, and a free particle.
+    e.addCluster({12, 14, 16, 12, 1}, {{0, 1}, {1, 2}, {2, 3}, {3, 0}, {3, 4}}, SHAPE);
+    e.addCluster({40}, {}, SHAPE);
+}
+
+// Springs to the origin, one stiffness each, and a pull along the velocity-free direction (1, 2, -1).
+static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+    vector<Vec3> forces;
+    for (size_t i = 0; i < positions.size(); i++)
+        forces.push_back(positions[i] * (-20.0 - (double) (i % 7)) + Vec3(1, 2, -1) * (double) (i % 5));
+    return forces;
+}
+
+static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
+    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, 8, false};
+}
+
+static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
+    vector<Vec3> positions = e.positions;
+    dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
+    for (int i = 0; i < steps; i++)
+        do
+            dynamics.step(INFINITY);
+        while (!dynamics.finish(forcesAt(dynamics.getNextPositions()), 0));
+}
+
+// Lambda = K^-1 (g''(v,v) + G M^-1 F) for g = |r|^2 - d^2, in the order of the constraints.
+static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleDynamics& dynamics) {
+    const int m = (int) e.constraints.size(), n = 3 * (int) e.masses.size();
+    Eigen::MatrixXd g = Eigen::MatrixXd::Zero(m, n);
+    Eigen::VectorXd curvature(m), force(n), inverseMass(n);
+    const vector<Vec3>&q = dynamics.getPositions(), &v = dynamics.getVelocities(), &f = dynamics.getForces();
+    for (int i = 0; i < n; i++) {
+        force[i] = f[i / 3][i % 3];
+        inverseMass[i] = 1 / e.masses[i / 3];
+    }
+    for (int k = 0; k < m; k++) {
+        const int a = e.constraints[k].particle1, b = e.constraints[k].particle2;
+        Vec3 r = q[a] - q[b], w = v[a] - v[b];
+        for (int j = 0; j < 3; j++) {
+            g(k, 3 * a + j) = 2 * r[j];
+            g(k, 3 * b + j) = -2 * r[j];
+        }
+        curvature[k] = 2 * w.dot(w);
+        ASSERT(std::fabs(std::sqrt(r.dot(r)) / e.constraints[k].length - 1) <= 1e-10);
+        ASSERT(std::fabs(r.dot(w)) < 1e-11); // the velocities are tangent
+    }
+    Eigen::MatrixXd k = g * inverseMass.asDiagonal() * g.transpose();
+    return k.ldlt().solve(curvature + g * inverseMass.cwiseProduct(force));
+}
+
+void testShapes(StepDensity::Update update) {
+    for (int copies : {1, 2, 3}) {
+        Example e;
+        makeExample(e, copies);
+        VRattleDynamics dynamics(e.masses, e.constraints);
+        ASSERT(dynamics.getConstraintSystem().getBatches().size() == 5);
+        ASSERT_EQUAL((int) e.constraints.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
+        dynamics.setSettings(makeSettings(update));
+        run(dynamics, e, 1);
+        const double reference = dynamics.getReference(0);
+        for (int i = 0; i < 50; i++) {
+            const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
+            dynamics.step(INFINITY);
+            ASSERT(dynamics.finish(forcesAt(dynamics.getNextPositions()), 0));
+            Eigen::VectorXd expected = denseMultipliers(e, dynamics);
+            vector<double> found;
+            dynamics.getConstraintSystem().getDistanceMultipliers(dynamics.getMultipliers(), found);
+            for (int k = 0; k < expected.size(); k++)
+                ASSERT(std::fabs(found[k] - expected[k]) <= 1e-9 * expected.norm());
+            ASSERT_EQUAL_TOL(expected.norm(), dynamics.getMonitorValues()[0], 1e-10);
+            if (update == StepDensity::Explicit) { // (3.15)
+                StepDensity density(update, 0.002, 0.002 / 50, 0.004);
+                ASSERT_EQUAL_TOL(2 * density.limit(u) - before, dynamics.getDensity(), 1e-12);
+            }
+        }
+        ASSERT_EQUAL(0, dynamics.getNumRescues());
+    }
+}
+
+void testThreads() {
+    // Enough waters, and an odd number of them, for the batches to be shared.
+    Example e;
+    for (int i = 0; i < 1101; i++)
+        e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
+    for (auto update : {StepDensity::SemiExplicit, StepDensity::Explicit}) {
+        vector<Vec3> positions;
+        double density = 0;
+        for (int numThreads : {1, 2, 3, 8}) {
+            VRattleDynamics dynamics(e.masses, e.constraints);
+            int calls = 0;
+            // Threads one after the other, in reverse: their order must not matter.
+            dynamics.setParallel(
+                [&](const std::function<void(int)>& task) {
+                    calls++;
+                    for (int thread = numThreads - 1; thread >= 0; thread--)
+                        task(thread);
+                },
+                numThreads);
+            dynamics.setSettings(makeSettings(update));
+            run(dynamics, e, 5);
+            ASSERT((calls > 0) == (numThreads > 1));
+            if (numThreads == 1) {
+                positions = dynamics.getPositions();
+                density = dynamics.getDensity();
+            }
+            for (size_t i = 0; i < positions.size(); i++)
+                ASSERT_EQUAL_VEC(positions[i], dynamics.getPositions()[i], 0.0);
+            ASSERT_EQUAL(density, dynamics.getDensity());
+        }
+    }
+}
+
+int main() {
+    return runTests({
+        {"clusters of every shape, SemiExplicit", [] { testShapes(StepDensity::SemiExplicit); }},
+        {"clusters of every shape, Explicit", [] { testShapes(StepDensity::Explicit); }},
+        {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
+        {"any number of threads", testThreads},
+    });
+}
