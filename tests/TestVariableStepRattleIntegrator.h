@@ -557,6 +557,18 @@ inline void testForcesThatChangeTheState() {
     ASSERT(largestDifference(reference.positions(), run.positions()) < 1e-6);
     ASSERT_EQUAL_TOL(plain.getStepDensity(), removing.getStepDensity(), 1e-5);
 
+    // With no monitor the multipliers are kept up to date as well: the solver starts from them, and needs no more updates.
+    VariableStepRattleIntegrator fixed(0.001), fixedRemoving(0.001);
+    fixed.clearMonitors();
+    fixedRemoving.clearMonitors();
+    TestSystem same;
+    makeChain(same, 8);
+    same.velocities = t.velocities;
+    Run fixedRun(same, fixed), fixedRemovingRun(t, fixedRemoving);
+    fixed.step(200);
+    fixedRemoving.step(200);
+    ASSERT(fixedRemoving.getNumSolverIterations() <= 1.2 * fixed.getNumSolverIterations());
+
     // A thermostat changes them for good; the constraints hold, and no density oscillates out of bounds.
     AndersenThermostat* thermostat = new AndersenThermostat(300, 20);
     thermostat->setRandomNumberSeed(5);

@@ -168,13 +168,11 @@ void VRattleDynamics::projectVelocities(vector<Vec3>& velocities) {
 // u(q,p) with Lambda = K^-1 (g''(v,v) + G M^-1 F)   (4.3)
 double VRattleDynamics::evaluateU(const vector<Vec3>& velocities) {
     ensureFactor(FullFactor);
-    if (monitor.needsMultipliers()) {
-        system.evaluateCurvature(velocities, rightSideTrial);
-        for (size_t k = 0; k < rightSideTrial.size(); k++)
-            rightSideTrial[k] += appliedTerm[k];
-        multiplierTrial = rightSideTrial;
-        matrix.solve(multiplierTrial);
-    }
+    system.evaluateCurvature(velocities, rightSideTrial);
+    for (size_t k = 0; k < rightSideTrial.size(); k++)
+        rightSideTrial[k] += appliedTerm[k];
+    multiplierTrial = rightSideTrial;
+    matrix.solve(multiplierTrial);
     monitor.evaluate(velocities, multiplierTrial, rightSideTrial, valuesTrial);
     return combineAndLimit(valuesTrial);
 }
