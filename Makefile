@@ -12,9 +12,10 @@ JOBS ?= $(shell $(PYTHON) -c "import os; print(min(2, os.cpu_count() or 1))")
 
 BIN := $(VENV)/bin
 TOOLS := $(VENV)/.tools-installed
+DOCS_TOOLS := $(VENV)/.docs-tools-installed
 CXX_FILES = $(shell find openmmapi platforms serialization tests -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize python-test install format clean
+.PHONY: all demo test check-format cxx-test sanitize python-test docs install format clean
 
 all: test
 
@@ -27,6 +28,7 @@ test:
 	$(MAKE) check-format
 	$(MAKE) cxx-test
 	$(MAKE) python-test
+	$(MAKE) docs
 
 check-format: $(TOOLS)
 	$(BIN)/ruff check .
@@ -53,6 +55,11 @@ sanitize: $(TOOLS)
 python-test: install $(TOOLS)
 	$(BIN)/python -m pytest python/tests
 
+# The documentation as HTML in docs/_build/html; warnings are errors.
+docs: install $(DOCS_TOOLS)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "The documentation is in docs/_build/html/index.html."
+
 # Always run: pip knows better than make what has changed. The build itself happens in an environment of its own.
 install: $(BIN)/python
 	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m pip install .
@@ -63,7 +70,7 @@ format: $(TOOLS)
 	$(BIN)/clang-format -i $(CXX_FILES)
 
 clean:
-	rm -rf $(BUILD) $(SANITIZE_BUILD) out $(VENV)
+	rm -rf $(BUILD) $(SANITIZE_BUILD) docs/_build out $(VENV)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -72,4 +79,8 @@ $(BIN)/python:
 
 $(TOOLS): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --group dev
+	touch $@
+
+$(DOCS_TOOLS): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --group docs
 	touch $@

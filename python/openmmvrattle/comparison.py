@@ -149,7 +149,7 @@ class Comparison:
             reference: ``control`` for RATTLE with fixed steps, ``fixed`` for OpenMM's VerletIntegrator.
 
         Returns:
-            The gain: above 1 the run is better. NaN if one of the two did not finish.
+            The gain; above 1 the run is better. NaN if one of the two did not finish.
         """
         other = self.run_of(reference)
         if other is None or run.failure is not None:

@@ -64,7 +64,7 @@ class StepControl:
     monitors: tuple[MonitorSettings, ...]
     """The monitors; none gives fixed steps."""
     nominal_step_size: float
-    """The step where the monitor has its reference value, in ps: a first guess where the steps are counted."""
+    """The step where the monitor has its reference value, in ps; a first guess where the steps are counted."""
     smallest_step_ratio: float = 1 / 50
     """Lower bound of the steps divided by the nominal step; 0 for no bound."""
     largest_step_ratio: float = 2.0

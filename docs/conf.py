@@ -1,0 +1,82 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""How Sphinx builds this documentation: `make docs`, with the package installed in the same environment."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import openmmvrattle
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+
+project = "OpenMM-VRATTLE"
+author = "OpenMM-VRATTLE contributors"
+project_copyright = "OpenMM-VRATTLE contributors, MIT licence"
+version = release = openmmvrattle.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "breathe",
+]
+exclude_patterns = ["_build"]
+smartquotes = False  # rho' is not a quotation
+
+html_theme = "furo"
+html_title = f"OpenMM-VRATTLE {version}"
+
+# The pages are read on code hosts as well: formulas between dollars, links to headings by their text.
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
+
+# Warnings are errors, and names that lead nowhere are warnings. Exempt is what others document elsewhere: Python,
+# NumPy, matplotlib, OpenMM and the C++ standard library.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(openmm|unit|app|numpy|np|matplotlib|collections|pathlib|typing|rich|pandas)(\..*)?"),
+    ("py:.*", r"(Any|Path|Callable|Sequence|Iterator|Figure|Quantity|Integrator|OpenMMException)"),
+    ("py:.*", r"(bool|dict|float|int|list|None|object|str|tuple|type|TypeError|ValueError|optional)"),
+    ("cpp:.*", r"(OpenMM|std)(::.*)?|string|vector|size_t"),
+]
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = True
+
+breathe_default_project = "openmmvrattle"
+breathe_projects = {"openmmvrattle": str(DOCS / "_build" / "doxygen" / "xml")}
+breathe_default_members = ("members",)
+
+
+def run_doxygen() -> None:
+    """Let Doxygen read the C++ headers; it stands beside this Python if the dependency group `docs` is installed."""
+    places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    doxygen = shutil.which("doxygen", path=places)
+    if doxygen is None:
+        raise RuntimeError("There is no doxygen. Install it: pip install --group docs.")
+    output = DOCS / "_build" / "doxygen"
+    output.mkdir(parents=True, exist_ok=True)
+    settings = (DOCS / "Doxyfile").read_text() + f'\nOUTPUT_DIRECTORY = "{output}"\n'
+    subprocess.run([doxygen, "-"], input=settings, text=True, cwd=ROOT, check=True)
+
+
+def escape_plain_text(app, what, name, obj, options, lines) -> None:
+    """Our docstrings are plain text for `help()`: keep their |F|, x* and U_ from being read as markup."""
+    if name.startswith("openmmvrattle.VariableStepRattleIntegrator"):
+        lines[:] = [re.sub(r"\||\*(?!\*)|_(?=\W|$)", r"\\\g<0>", line) for line in lines]
+
+
+def setup(app) -> None:
+    run_doxygen()
+    app.connect("autodoc-process-docstring", escape_plain_text, priority=100)
