@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import openmmvrattle
+from sphinx.errors import ExtensionError
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -22,7 +23,7 @@ project_copyright = "OpenMM-VRATTLE contributors, MIT licence"
 version = release = openmmvrattle.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
@@ -37,6 +38,8 @@ html_title = f"OpenMM-VRATTLE {version}"
 # The pages are read on code hosts as well: formulas between dollars, links to headings by their text.
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
+nb_execution_mode = "force"  # the notebook is kept without output
+nb_execution_raise_on_error = True
 
 # Warnings are errors, and names that lead nowhere are warnings. Exempt is what others document elsewhere: Python,
 # NumPy, matplotlib, OpenMM and the C++ standard library.
@@ -64,11 +67,22 @@ def run_doxygen() -> None:
     places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     doxygen = shutil.which("doxygen", path=places)
     if doxygen is None:
-        raise RuntimeError("There is no doxygen. Install it: pip install --group docs.")
+        raise ExtensionError("There is no doxygen. Install it: pip install --group docs.")
     output = DOCS / "_build" / "doxygen"
     output.mkdir(parents=True, exist_ok=True)
     settings = (DOCS / "Doxyfile").read_text() + f'\nOUTPUT_DIRECTORY = "{output}"\n'
-    subprocess.run([doxygen, "-"], input=settings, text=True, cwd=ROOT, check=True)
+    try:
+        subprocess.run([doxygen, "-"], input=settings, text=True, cwd=ROOT, check=True)
+    except subprocess.CalledProcessError as error:
+        raise ExtensionError("Doxygen has found faults in the C++ headers, see above.") from error
+
+
+def copy_notebook() -> None:
+    """Sphinx reads nothing outside of its folder, and the notebook belongs to the examples."""
+    text = (ROOT / "examples" / "quick_tour.ipynb").read_text(encoding="utf-8")
+    copy = DOCS / "quick_tour.ipynb"
+    if not copy.exists() or copy.read_text(encoding="utf-8") != text:
+        copy.write_text(text, encoding="utf-8")
 
 
 def escape_plain_text(app, what, name, obj, options, lines) -> None:
@@ -79,4 +93,5 @@ def escape_plain_text(app, what, name, obj, options, lines) -> None:
 
 def setup(app) -> None:
     run_doxygen()
+    copy_notebook()
     app.connect("autodoc-process-docstring", escape_plain_text, priority=100)

@@ -1,0 +1,134 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The documentation: its Python snippets run, its links lead somewhere, and no public name is without a docstring.
+
+The blocks marked as Python of one page run one after the other, as a reader would type them. `system`, `topology`,
+`positions` and `integrator` are there before the first: the pages speak of those of the reader's own script.
+"""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import openmm
+import openmmvrattle
+import pytest
+from markdown_it import MarkdownIt
+from openmm import app, unit
+from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.testsystems import alanine_dipeptide
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted(
+    path
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.md")]
+    if "_build" not in path.parts
+)
+MODULES = [
+    importlib.import_module(f"openmmvrattle.{module.name}")
+    for module in pkgutil.iter_modules(openmmvrattle.__path__)
+    if not module.name.startswith("_") and module.name != "vrattle"
+]
+
+
+def name_of(value: object) -> str:
+    """How a page or a module is called in the list of tests."""
+    return str(value.relative_to(ROOT)) if isinstance(value, Path) else getattr(value, "__name__", "")
+
+
+def fences(page: Path, language: str) -> list[tuple[int, str]]:
+    """The code blocks of a page in one language, each with the line where it begins (from 0)."""
+    tokens = MarkdownIt().parse(page.read_text(encoding="utf-8"))
+    return [
+        (token.map[0] + 1, token.content)
+        for token in tokens
+        if token.type == "fence" and token.map is not None and token.info.split() == [language]
+    ]
+
+
+def test_there_are_pages_and_snippets() -> None:
+    assert {"README.md", "CHANGELOG.md"} < {page.name for page in PAGES}
+    assert sum(len(fences(page, "python")) for page in PAGES) >= 3
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if fences(page, "python")], ids=name_of)
+def test_the_snippets_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # for files that snippets write
+    example = alanine_dipeptide()
+    namespace = {
+        "openmm": openmm,
+        "app": app,
+        "unit": unit,
+        "VariableStepRattleIntegrator": VariableStepRattleIntegrator,
+        "system": example.system,
+        "topology": example.topology,
+        "positions": example.positions,
+        "integrator": VariableStepRattleIntegrator(0.001),
+    }
+    for line, code in fences(page, "python"):
+        exec(compile("\n" * line + code, str(page), "exec"), namespace)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_links_of_a_page_lead_to_files(page: Path) -> None:
+    for token in MarkdownIt().parse(page.read_text(encoding="utf-8")):
+        for inline in token.children or []:
+            target = inline.attrGet("href") or inline.attrGet("src")
+            if target and not re.match(r"[a-z]+:|#", str(target)):
+                file = page.parent / unquote(str(target).split("#")[0])
+                assert file.exists(), f"{page.relative_to(ROOT)} links to {target}, which is not there"
+
+
+@pytest.mark.parametrize("module", [openmmvrattle, *MODULES], ids=name_of)
+def test_the_examples_in_docstrings_are_true(module: object) -> None:
+    assert doctest.testmod(module, optionflags=doctest.ELLIPSIS).failed == 0
+
+
+def public_members(cls: type) -> dict[str, object]:
+    """The methods and properties of a class that are its own and that users may call."""
+    return {
+        name: member.__func__ if isinstance(member, (staticmethod, classmethod)) else member
+        for name, member in vars(cls).items()
+        if not name.startswith("_")
+        and isinstance(member, (staticmethod, classmethod, property)) | inspect.isfunction(member)
+    }
+
+
+@pytest.mark.parametrize("module", [openmmvrattle, *MODULES], ids=name_of)
+def test_every_public_name_has_a_docstring(module: object) -> None:
+    assert inspect.getdoc(module)
+    for name in getattr(module, "__all__", []):
+        value = getattr(module, name)
+        if inspect.isfunction(value) or inspect.isclass(value):
+            assert value.__doc__, f"{name} has no docstring"
+        if inspect.isclass(value):
+            for member_name, member in public_members(value).items():
+                assert member.__doc__, f"{name}.{member_name} has no docstring"
+
+
+@pytest.mark.parametrize("name", sorted(set(public_members(VariableStepRattleIntegrator)) - {"thisown"}))
+def test_the_docstring_of_a_method_says_what_it_takes_returns_and_raises(name: str) -> None:
+    method = public_members(VariableStepRattleIntegrator)[name]
+    documentation = inspect.getdoc(method)
+    signature = inspect.signature(method)
+    parameters = {parameter: p.annotation for parameter, p in signature.parameters.items() if parameter != "self"}
+    for parameter, annotation in parameters.items():
+        explanation = re.search(rf"^{parameter} : .+\n((    .*\n?)+)", documentation, re.MULTILINE)
+        assert explanation, f"nothing is said of {parameter}"
+        if "Quantity" in str(annotation):
+            assert "(in ps)" in explanation[1], f"{parameter} has no unit"
+    if name.startswith(("set", "add")) and parameters:
+        assert "Raises\n------" in documentation
+    returns = re.search(r"Returns\n-------\n.+\n((    .*\n?)+)", documentation)
+    if signature.return_annotation is not None:
+        assert returns, "nothing is said of what is returned"
+        if "Quantity" in str(signature.return_annotation):
+            assert re.search(r"picoseconds|kJ/mol", returns[1]), "the result has no unit"
+    else:
+        assert not returns

@@ -1,0 +1,76 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The type stub of the integrator agrees with the class, and a type checker makes use of it.
+
+OpenMM has no types of its own: to a type checker its Quantity and what is inherited from its Integrator can be
+anything.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CONFIGURATION = "[mypy]\nstrict = true\n[mypy-openmm.*]\nignore_missing_imports = true\n"
+
+GOOD_SCRIPT = """\
+from openmm import unit
+from openmmvrattle import VariableStepRattleIntegrator, XmlSerializer
+
+integrator = VariableStepRattleIntegrator(
+    0.002, VariableStepRattleIntegrator.Explicit, maximumStepSize=4 * unit.femtosecond, monitors=[]
+)
+index: int = integrator.addMonitor(VariableStepRattleIntegrator.ForcePNorm, power=0.5)
+kind, weight, power = integrator.getMonitor(index)
+half: float = weight * power / 2
+rho: float = integrator.getStepDensity()
+integrator.setReferenceMonitorValue(half + rho, index)
+text: str = XmlSerializer.serialize(integrator)
+"""
+
+BAD_SCRIPT = """\
+from openmmvrattle import VariableStepRattleIntegrator
+
+integrator = VariableStepRattleIntegrator()
+integrator.addMonitor("ConstraintForce")
+step: int = integrator.getMonitor(0)
+text: str = integrator.getStepDensity()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "mypy.ini").write_text(CONFIGURATION)
+    return tmp_path
+
+
+def mypy(folder: Path, script: str) -> tuple[int, str]:
+    (folder / "script.py").write_text(script)
+    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--cache-dir", "cache", "script.py"]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return result.returncode, result.stdout + result.stderr
+
+
+def test_the_stub_agrees_with_the_class(folder: Path) -> None:
+    """Names, signatures and constants, compared by mypy's stubtest with the class as Python sees it."""
+    swig = ["SwigPyIterator", r"VariableStepRattleIntegrator\.(__swig_destroy__|thisown)"]
+    (folder / "allowed").write_text("".join(rf"openmmvrattle\.vrattle\.{name}" + "\n" for name in swig))
+    options = ["--mypy-config-file", "mypy.ini", "--allowlist", "allowed"]
+    command = [sys.executable, "-m", "mypy.stubtest", "openmmvrattle.vrattle", *options]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_a_script_that_is_right_passes(folder: Path) -> None:
+    status, output = mypy(folder, GOOD_SCRIPT)
+    assert status == 0, output
+
+
+def test_what_is_wrong_in_a_script_is_found(folder: Path) -> None:
+    status, output = mypy(folder, BAD_SCRIPT)
+    assert status == 1
+    for line, what in [(3, "call-arg"), (4, "arg-type"), (5, "assignment"), (6, "assignment")]:
+        assert any(found.startswith(f"script.py:{line}:") and what in found for found in output.splitlines()), output
