@@ -17,8 +17,9 @@ import numpy as np
 import openmm
 import pytest
 from openmmvrattle import __main__ as command_line
-from openmmvrattle import comparison as comparison_module
+from openmmvrattle import measurement as measurement_module
 from openmmvrattle import plots
+from openmmvrattle.commands.compare import print_comparison
 from openmmvrattle.comparison import (
     Comparison,
     IntegratorRun,
@@ -231,12 +232,12 @@ def test_leapfrog_starts_from_the_energy_of_the_others():
     """Without the half step back its energy at time 0 would be off by the work of half a step."""
     test_system = SYSTEMS["alanine-dipeptide-hbonds"]()
     settings = quick_settings(test_system.settings)
-    method = comparison_module._methods(settings)[0]
-    integrator, context = comparison_module._start(method, 0.001, test_system, "Reference", settings)
-    expected = comparison_module._initial_energy(test_system, "Reference")
-    assert comparison_module._energy(context) == pytest.approx(expected, abs=1e-6)
+    method = measurement_module.methods_of(settings)[0]
+    integrator, context = measurement_module._start(method, 0.001, test_system, "Reference", settings)
+    expected = measurement_module.initial_energy(test_system, "Reference")
+    assert measurement_module._energy(context) == pytest.approx(expected, abs=1e-6)
     context.setVelocities(test_system.velocities)
-    assert abs(comparison_module._energy(context) - expected) > 1e-3
+    assert abs(measurement_module._energy(context) - expected) > 1e-3
     assert isinstance(integrator, openmm.VerletIntegrator)
 
 
@@ -266,7 +267,7 @@ def test_verdict_when_fixed_steps_fail():
 
 
 def test_verdict_when_all_fail():
-    assert verdict(make_comparison(make_run(failure="a"))) == ["No integrator reached the end."]
+    assert verdict(make_comparison(make_run(failure="a"))) == ["No integrator reached the end.", "fixed failed: a."]
 
 
 def test_gain():
@@ -350,7 +351,7 @@ def test_files(chain, tmp_path):
 def test_table_is_whole(chain, width):
     """No number may be cut, however narrow the window."""
     console = Console(width=width, file=io.StringIO())
-    command_line._print_comparison(console, chain)
+    print_comparison(console, chain)
     text = console.file.getvalue()
     assert "…" not in text
     for run in chain.runs:
