@@ -40,22 +40,19 @@ from .measurement import (
     Series,
     failed_run,
     initial_energy,
-    make_integrator,
     methods_of,
     run_method,
     run_to_accuracy,
 )
+from .measurement import make_integrator as make_integrator  # scripts look for it here
 from .testsystems import ComparisonSettings, TestSystem
 
 __all__ = [
     "Case",
     "Comparison",
     "Envelope",
-    "IntegratorRun",
-    "Series",
     "compare",
     "envelope",
-    "make_integrator",
     "quick_settings",
     "run_case",
     "two_digits",
@@ -83,11 +80,11 @@ class Comparison:
     runs: tuple[IntegratorRun, ...]
     interrupted: bool = False
     label: str = ""
-    """The name of its files: the name of the system, and what sets it apart from other comparisons of that system."""
+    """The name of its files, which is that of the system and what sets it apart from other comparisons of that system."""
     seed: int | None = None
     """Of the random start, if one was chosen."""
     wanted_error: float | None = None
-    """kJ/mol: if given, each integrator was given as many force evaluations as it needs for this energy error."""
+    """In kJ/mol; if given, each integrator got as many force evaluations as it needs for this energy error."""
     notes: tuple[str, ...] = ()
     """What was changed in a system that the user gave."""
 
@@ -192,7 +189,7 @@ class Case:
     integrators: tuple[str, ...] = ()
     """Names out of `openmmvrattle.measurement.INTEGRATORS`; none for all."""
     wanted_error: float | None = None
-    """kJ/mol: compare at equal accuracy instead of equal force evaluations."""
+    """In kJ/mol; if given, compare at this accuracy instead of at equal force evaluations."""
     most_evaluations: int | None = None
     """The largest number of force evaluations that is tried for it."""
     label: str = ""

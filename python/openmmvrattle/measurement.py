@@ -159,7 +159,7 @@ INTEGRATORS: dict[str, Callable[[ComparisonSettings], list[Method]]] = {
     "RATTLE": _rattle,
     "VRATTLE": _vrattle,
 }
-"""What can be compared, by name: each value gives the methods to run for the settings. ``RATTLE`` is our integrator
+"""What can be compared, by name; each value gives the methods to run for the settings. ``RATTLE`` is our integrator
 without a monitor, which has fixed steps; ``VRATTLE`` is the same with each of the step controls of the settings."""
 
 
