@@ -4,12 +4,26 @@
 #include "StepMonitor.h"
 #include <algorithm>
 #include <cmath>
+#include <initializer_list>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
 namespace {
+
+// The sum of term(0), ..., term(count - 1) in four interleaved parts: a processor waits for each addition to one number, and
+// adds to several at a time.
+template <class Term> double sumOf(int count, Term term) {
+    double part[4] = {0, 0, 0, 0};
+    int i = 0;
+    for (; i + 4 <= count; i += 4)
+        for (int j = 0; j < 4; j++)
+            part[j] += term(i + j);
+    for (; i < count; i++)
+        part[0] += term(i);
+    return (part[0] + part[1]) + (part[2] + part[3]);
+}
 
 // (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
 template <class Size> double pNorm(int count, double order, Size size) {
@@ -18,10 +32,7 @@ template <class Size> double pNorm(int count, double order, Size size) {
         largest = std::max(largest, size(i));
     if (largest == 0)
         return 0;
-    double sum = 0;
-    for (int i = 0; i < count; i++)
-        sum += std::pow(size(i) / largest, order);
-    return largest * std::pow(sum, 1 / order);
+    return largest * std::pow(sumOf(count, [&](int i) { return std::pow(size(i) / largest, order); }), 1 / order);
 }
 
 bool usesConstraintsOnly(StepMonitor::Kind kind) {
@@ -82,29 +93,29 @@ void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
     groupEnergy = energy;
     appliedForceSquared = forceSquared = maxForce = forcePNorm = 0;
     const vector<double>& inverseMasses = system.getInverseMasses();
-    bool needsPNorm = false;
-    for (const Term& term : terms)
-        needsPNorm |= term.kind == ForcePNorm;
-    for (int i = 0; i < system.getNumParticles(); i++)
-        if (inverseMasses[i] > 0) {
-            double square = newForces[i].dot(newForces[i]);
-            appliedForceSquared += square * inverseMasses[i];
-            forceSquared += square;
-            maxForce = std::max(maxForce, square);
-        }
-    maxForce = std::sqrt(maxForce);
-    if (needsPNorm)
-        forcePNorm = pNorm(system.getNumParticles(), normOrder, [&](int i) {
-            return inverseMasses[i] > 0 ? std::sqrt(newForces[i].dot(newForces[i])) : 0.0;
+    const int numParticles = system.getNumParticles();
+    // The force on a particle that does not move is of no interest, even if it is not a number.
+    auto squareOf = [&](int i) { return inverseMasses[i] > 0 ? newForces[i].dot(newForces[i]) : 0.0; };
+    auto isWanted = [&](std::initializer_list<Kind> kinds) {
+        return std::any_of(terms.begin(), terms.end(), [&](const Term& term) {
+            return std::find(kinds.begin(), kinds.end(), term.kind) != kinds.end();
         });
+    };
+    forceSquared = sumOf(numParticles, squareOf);
+    if (isWanted({AppliedForce, ConstraintAndAppliedForce}))
+        appliedForceSquared = sumOf(numParticles, [&](int i) { return squareOf(i) * inverseMasses[i]; });
+    if (isWanted({MaxForce}))
+        for (int i = 0; i < numParticles; i++)
+            maxForce = std::max(maxForce, squareOf(i));
+    maxForce = std::sqrt(maxForce);
+    if (isWanted({ForcePNorm}))
+        forcePNorm = pNorm(numParticles, normOrder, [&](int i) { return std::sqrt(squareOf(i)); });
 }
 
 void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const vector<double>& rightSide,
                            vector<double>& values) {
     // Lambda^T K Lambda; rounding could make it negative where it vanishes.
-    double sum = 0;
-    for (size_t k = 0; k < multipliers.size(); k++)
-        sum += multipliers[k] * rightSide[k];
+    const double sum = sumOf((int) multipliers.size(), [&](int k) { return multipliers[k] * rightSide[k]; });
     constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
     values.resize(terms.size());
     for (size_t i = 0; i < terms.size(); i++)
@@ -150,10 +161,10 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
         double sum = 0;
         switch (terms[i].kind) {
         case ConstraintMultipliers:
-            for (int k = 0; k < numConstraints; k++) {
+            sum = sumOf(numConstraints, [&](int k) {
                 double d = system.toDistanceMultiplier(k);
-                sum += d * d * multipliers[k] * multiplierRate[k];
-            }
+                return d * d * multipliers[k] * multiplierRate[k];
+            });
             rate += factor * sum / value;
             break;
         case MultiplierPNorm:
@@ -166,8 +177,7 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
             break;
         case ConstraintForce:
         case ConstraintAndAppliedForce:
-            for (int k = 0; k < numConstraints; k++)
-                sum += rightSide[k] * multiplierRate[k];
+            sum = sumOf(numConstraints, [&](int k) { return rightSide[k] * multiplierRate[k]; });
             rate += factor * sum / value;
             break;
         case VectorField:
@@ -201,12 +211,8 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     auto distanceMultiplier = [&](int k) { return multipliers[k] * system.toDistanceMultiplier(k); };
     switch (term.kind) {
-    case ConstraintMultipliers: { // (4.4)
-        double sum = 0;
-        for (int k = 0; k < numConstraints; k++)
-            sum += distanceMultiplier(k) * distanceMultiplier(k);
-        return std::sqrt(sum);
-    }
+    case ConstraintMultipliers: // (4.4)
+        return std::sqrt(sumOf(numConstraints, [&](int k) { return distanceMultiplier(k) * distanceMultiplier(k); }));
     case ConstraintForce:
         return std::sqrt(constraintForceSquared);
     case AppliedForce:
@@ -217,21 +223,13 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
         return pNorm(numConstraints, normOrder, [&](int k) { return std::fabs(distanceMultiplier(k)); });
     case ForcePNorm:
         return forcePNorm;
-    case VectorField: { // (4.1)
-        double sum = forceSquared;
-        for (int i = 0; i < numParticles; i++)
-            sum += masses[i] * v[i].dot(v[i]);
-        return std::sqrt(sum);
-    }
+    case VectorField: // (4.1)
+        return std::sqrt(forceSquared + sumOf(numParticles, [&](int i) { return masses[i] * v[i].dot(v[i]); }));
     case MaxForce:
         return maxForce;
-    case ArcLength: {
-        double sum = forceSquared;
-        for (int i = 0; i < numParticles; i++)
-            if (masses[i] > 0)
-                sum += v[i].dot(v[i]);
-        return std::sqrt(sum);
-    }
+    case ArcLength:
+        return std::sqrt(forceSquared +
+                         sumOf(numParticles, [&](int i) { return masses[i] > 0 ? v[i].dot(v[i]) : 0.0; }));
     case MaxParticleArcLength: {
         double largest = 0;
         for (int i = 0; i < numParticles; i++)

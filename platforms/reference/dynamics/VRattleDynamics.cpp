@@ -15,9 +15,10 @@ using std::vector;
 namespace {
 
 const int MAX_CHORD_ITERATIONS = 12, MAX_NEWTON_ITERATIONS = 50;
-// Threads share the batches from this number of constraints on: a call of the thread pool costs about 6 us, and a pass 15 ns
-// a constraint.
-const int MIN_PARALLEL_CONSTRAINTS = 3000;
+// Threads share the batches from this number of constraints on. A pass costs 10 to 25 ns a constraint; a call of the thread
+// pool 6 us if all threads are awake, and ten times that within a run, where they are not (measured: with 6,000 constraints
+// two threads were slower than one, with 24,000 faster).
+const int MIN_PARALLEL_CONSTRAINTS = 12000;
 // If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
 const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 // The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
@@ -746,7 +747,7 @@ double VRattleDynamics::step(double maxStep) {
     return stepNext;
 }
 
-bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
+bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
     vector<double> backValues;
     const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
@@ -768,7 +769,7 @@ bool VRattleDynamics::finish(const vector<Vec3>& forces, double energy) {
     q.swap(qNext);
     v.swap(vNext);
     w.swap(wNext);
-    force = forces;
+    force.swap(forces);
     groupEnergy = energy;
     lambda.swap(lambdaOnStep);
     rightSide.swap(rightSideNext);

@@ -116,13 +116,14 @@ public:
     /**
      * The second half of a step.
      *
-     * @param forces         the applied forces at getNextPositions()
-     * @param groupEnergy    the energy of the monitor's force group there
+     * @param[in,out] forces    the applied forces at getNextPositions(); if the step is complete their storage is taken
+     *                          over, and that of the forces before is left in its place
+     * @param groupEnergy       the energy of the monitor's force group there
      * @return whether the step is complete. If not, the state is as before step(), the density of the first step is now known
      *         better, and both halves are to be done again. This happens once, at a start with given reference values.
      * @throws StepFailure    if the forces are not finite or the constraints have become dependent
      */
-    bool finish(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     /** Turn time around, without a force. */
     void reverse();
 

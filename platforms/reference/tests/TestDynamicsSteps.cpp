@@ -69,13 +69,19 @@ static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, 8, false};
 }
 
+// Both halves of a step; returns whether it is complete.
+static bool takeStep(VRattleDynamics& dynamics) {
+    dynamics.step(INFINITY);
+    vector<Vec3> forces = forcesAt(dynamics.getNextPositions());
+    return dynamics.finish(forces, 0);
+}
+
 static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
     vector<Vec3> positions = e.positions;
     dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
     for (int i = 0; i < steps; i++)
-        do
-            dynamics.step(INFINITY);
-        while (!dynamics.finish(forcesAt(dynamics.getNextPositions()), 0));
+        while (!takeStep(dynamics)) {
+        }
 }
 
 // Lambda = K^-1 (g''(v,v) + G M^-1 F) for g = |r|^2 - d^2, in the order of the constraints.
@@ -115,8 +121,7 @@ void testShapes(StepDensity::Update update) {
         const double reference = dynamics.getReference(0);
         for (int i = 0; i < 50; i++) {
             const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
-            dynamics.step(INFINITY);
-            ASSERT(dynamics.finish(forcesAt(dynamics.getNextPositions()), 0));
+            ASSERT(takeStep(dynamics));
             Eigen::VectorXd expected = denseMultipliers(e, dynamics);
             vector<double> found;
             dynamics.getConstraintSystem().getDistanceMultipliers(dynamics.getMultipliers(), found);
@@ -135,7 +140,7 @@ void testShapes(StepDensity::Update update) {
 void testThreads() {
     // Enough waters, and an odd number of them, for the batches to be shared.
     Example e;
-    for (int i = 0; i < 1101; i++)
+    for (int i = 0; i < 4001; i++)
         e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
     for (auto update : {StepDensity::SemiExplicit, StepDensity::Explicit}) {
         vector<Vec3> positions;
