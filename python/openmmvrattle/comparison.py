@@ -80,7 +80,7 @@ class Comparison:
     runs: tuple[IntegratorRun, ...]
     interrupted: bool = False
     label: str = ""
-    """The name of its files, which is that of the system and what sets it apart from other comparisons of that system."""
+    """The name of its files, which is that of the system and what sets it apart from other comparisons of it."""
     seed: int | None = None
     """Of the random start, if one was chosen."""
     wanted_error: float | None = None

@@ -212,7 +212,7 @@ def from_system(
         velocities=np.zeros_like(positions),
         description=description,
         settings=settings,
-        parameters=parameters or {},
+        parameters=tuple((parameters or {}).items()),
         notes=tuple(notes),
     )
     try:
@@ -238,7 +238,7 @@ def _started(
     integrator.setRandomNumberSeed(seed)
     integrator.setConstraintTolerance(1e-8)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
-    for name, value in start.parameters.items():
+    for name, value in start.parameters:
         context.setParameter(name, value)
     context.setPositions(start.positions)
     if minimize:

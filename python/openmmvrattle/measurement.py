@@ -510,7 +510,7 @@ def _start(
         integrator = method.make(parameter)
         integrator.setConstraintTolerance(settings.constraint_tolerance)
         context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName(platform))
-        for name, value in test_system.parameters.items():
+        for name, value in test_system.parameters:
             context.setParameter(name, value)
         context.setPositions(test_system.positions)
         velocities = test_system.velocities
@@ -581,7 +581,7 @@ def initial_energy(test_system: TestSystem, platform: str) -> float:
     """The energy at the start, in kJ/mol, from the velocities as they are."""
     integrator = openmm.VerletIntegrator(1e-6)
     context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName(platform))
-    for name, value in test_system.parameters.items():
+    for name, value in test_system.parameters:
         context.setParameter(name, value)
     context.setPositions(test_system.positions)
     system = test_system.system

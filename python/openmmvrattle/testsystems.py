@@ -17,8 +17,8 @@ import functools
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any, ClassVar
 
@@ -112,8 +112,8 @@ class TestSystem:
     """nm/ps, tangent to the constraints"""
     description: str
     settings: ComparisonSettings
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    """Values of global parameters that differ from the defaults in the System."""
+    parameters: tuple[tuple[str, float], ...] = ()
+    """Names and values of global parameters, where they differ from the defaults in the System."""
     notes: tuple[str, ...] = ()
     """What was changed to make the system from what the user gave, in sentences."""
 
