@@ -13,9 +13,12 @@ JOBS ?= $(shell $(PYTHON) -c "import os; print(min(2, os.cpu_count() or 1))")
 BIN := $(VENV)/bin
 TOOLS := $(VENV)/.tools-installed
 DOCS_TOOLS := $(VENV)/.docs-tools-installed
+PACKAGE_TOOLS := $(VENV)/.package-tools-installed
+# What `make wheel` and `make sdist` give to pytest, for example "-k wrapper".
+PYTEST_ARGUMENTS ?=
 CXX_FILES = $(shell find openmmapi platforms serialization tests -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize python-test docs install format clean
+.PHONY: all demo test check-format cxx-test sanitize python-test docs wheel sdist conda install format clean
 
 all: test
 
@@ -60,6 +63,37 @@ docs: install $(DOCS_TOOLS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html."
 
+# test_package FILE FOLDER: install FILE into an environment of its own, and run the tests of FOLDER from outside of it.
+define test_package
+	@set -e; environment=$$(mktemp -d); trap 'rm -rf "$$environment"' EXIT; set -x; \
+	$(PYTHON) -m venv "$$environment/venv"; \
+	"$$environment/venv/bin/python" -m pip install --quiet "$$(echo $(1))[test]"; \
+	cd "$$environment"; \
+	venv/bin/python -c "import openmmvrattle as o; print(o.__file__); assert o.__file__.startswith('$$environment')"; \
+	venv/bin/python -m pytest -p no:cacheprovider "$(2)/python/tests" $(PYTEST_ARGUMENTS)
+endef
+
+# A wheel in dist, without OpenMM's libraries: they are those of the package openmm beside it. auditwheel names it by the
+# oldest C library that it runs with.
+wheel: $(PACKAGE_TOOLS)
+	rm -rf dist/*.whl $(BUILD)/wheel
+	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m build --wheel --outdir $(BUILD)/wheel .
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --exclude libOpenMM.so --exclude libOpenMMOpenCL.so \
+		--exclude libOpenMMCUDA.so --wheel-dir dist $(BUILD)/wheel/*.whl
+	$(call test_package,$(CURDIR)/dist/*.whl,$(CURDIR))
+
+# The sources in dist, from which a build is made and tested with the tests that are in the archive.
+sdist: $(PACKAGE_TOOLS)
+	rm -rf dist/*.tar.gz $(BUILD)/sdist
+	$(BIN)/python -m build --sdist --outdir dist .
+	mkdir -p $(BUILD)/sdist
+	tar -xzf dist/*.tar.gz -C $(BUILD)/sdist --strip-components 1
+	$(call test_package,$(CURDIR)/$(BUILD)/sdist,$(CURDIR)/$(BUILD)/sdist)
+
+# The recipe for conda as it would be built.
+conda: $(PACKAGE_TOOLS)
+	$(BIN)/python conda/render.py
+
 # Always run: pip knows better than make what has changed. The build itself happens in an environment of its own.
 install: $(BIN)/python
 	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m pip install .
@@ -70,7 +104,7 @@ format: $(TOOLS)
 	$(BIN)/clang-format -i $(CXX_FILES)
 
 clean:
-	rm -rf $(BUILD) $(SANITIZE_BUILD) docs/_build out $(VENV)
+	rm -rf $(BUILD) $(SANITIZE_BUILD) docs/_build dist out $(VENV)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -83,4 +117,8 @@ $(TOOLS): pyproject.toml | $(BIN)/python
 
 $(DOCS_TOOLS): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --group docs
+	touch $@
+
+$(PACKAGE_TOOLS): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --group package
 	touch $@
