@@ -77,6 +77,9 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
         appendCluster(given, cluster);
     findCouplings();
     classifyParticles(isInBatch);
+    isFreeToTranslate = std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
+        return inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0;
+    });
     for (const DistanceConstraint& c : constraints) {
         inverseSquareLengths.push_back(1.0 / (c.length * c.length));
         distanceMultiplierFactors.push_back(0.5 / (c.length * c.length));

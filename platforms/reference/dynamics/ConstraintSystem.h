@@ -93,6 +93,10 @@ public:
     const std::vector<int>& getFreeParticles() const {
         return freeParticles;
     }
+    /** Whether a motion of all particles with mass at one velocity satisfies the constraints: none holds a fixed particle. */
+    bool isTranslationInvariant() const {
+        return isFreeToTranslate;
+    }
     /** The particles of a cluster, in increasing order. */
     std::vector<int> getClusterParticles(int cluster) const;
 
@@ -132,6 +136,7 @@ private:
     void findCouplings();
     void classifyParticles(const std::vector<char>& isInBatch);
     int numGivenConstraints, firstGeneral;
+    bool isFreeToTranslate;
     std::vector<double> masses, inverseMasses;
     std::vector<DistanceConstraint> constraints;
     std::vector<int> givenIndex; // internal order -> order of the constructor

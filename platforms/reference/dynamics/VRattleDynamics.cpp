@@ -28,6 +28,8 @@ const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // The density equation (3.14) is solved to the tolerance of the constraints, but not closer than rounding of U allows; and
 // where strained, badly scaled constraints make that rounding larger, the second number counts.
 const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
+// Differences of the velocities of particles that are the same but for the rounding of both.
+const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
 
@@ -356,6 +358,27 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
     rescaleDensity(oldU);
     if (hasDensity)
         formHalfStepVelocities();
+}
+
+bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
+    if (!system.isTranslationInvariant() || movingParticles.empty())
+        return false;
+    const Vec3 shift = velocities[movingParticles[0]] - v[movingParticles[0]];
+    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
+    const double reference = sizeOf(shift) + sizeOf(v[movingParticles[0]]);
+    for (int i : movingParticles)
+        if (!(sizeOf(velocities[i] - v[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(v[i]))))
+            return false;
+    for (int i : movingParticles) {
+        v[i] = velocities[i];
+        w[i] += shift;
+    }
+    if (monitor.usesVelocities()) {
+        monitor.evaluate(v, lambda, rightSide, values);
+        hasHalfStepValue = false;
+        rescaleDensity(u);
+    }
+    return true;
 }
 
 void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {

@@ -102,6 +102,14 @@ public:
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * Go on with velocities that are the present ones seen from a uniformly moving frame, as a remover of the motion of the
+     * centre of mass leaves them in each step. Constraints between moving particles and their multipliers know nothing of it, so
+     * that it costs no more than to look.
+     *
+     * @return whether that is what they are; if not, nothing has been changed
+     */
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
     /** Go on with changed velocities at the same positions; as changeState(). */
     void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
 

@@ -2,7 +2,9 @@
 // SPDX-License-Identifier: MIT
 
 #include "ReferenceVRattleKernels.h"
+#include "openmm/AndersenThermostat.h"
 #include "openmm/CMAPTorsionForce.h"
+#include "openmm/CMMotionRemover.h"
 #include "openmm/CustomAngleForce.h"
 #include "openmm/CustomBondForce.h"
 #include "openmm/CustomCentroidBondForce.h"
@@ -60,9 +62,10 @@ void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, co
                                       std::to_string(i) + " is not a finite number; set it before stepping");
 }
 
-// Whether a Force may change positions or velocities before a step (ForceImpl::updateContextState). Of OpenMM's own Forces that
-// are mere functions of the positions we know that they do not; of all others we do not.
-bool mayChangeState(const OpenMM::Force& force) {
+// What a Force may change before a step (ForceImpl::updateContextState). Of OpenMM's own Forces that are mere functions of the
+// positions we know that they change nothing, of some others that they leave the positions alone; of all others we know nothing.
+enum Reach { NoReach, VelocityReach, FullReach };
+Reach reachOf(const OpenMM::Force& force) {
     static const std::set<std::type_index> harmless = {
         typeid(OpenMM::CMAPTorsionForce),        typeid(OpenMM::CustomAngleForce),
         typeid(OpenMM::CustomBondForce),         typeid(OpenMM::CustomCentroidBondForce),
@@ -73,7 +76,11 @@ bool mayChangeState(const OpenMM::Force& force) {
         typeid(OpenMM::GayBerneForce),           typeid(OpenMM::HarmonicAngleForce),
         typeid(OpenMM::HarmonicBondForce),       typeid(OpenMM::NonbondedForce),
         typeid(OpenMM::PeriodicTorsionForce),    typeid(OpenMM::RBTorsionForce)};
-    return harmless.count(typeid(force)) == 0;
+    static const std::set<std::type_index> thermal = {typeid(OpenMM::AndersenThermostat),
+                                                      typeid(OpenMM::CMMotionRemover)};
+    if (harmless.count(typeid(force)) > 0)
+        return NoReach;
+    return thermal.count(typeid(force)) > 0 ? VelocityReach : FullReach;
 }
 
 // Whether two sets of forces are the same but for rounding; a particle in equilibrium is measured by the others.
@@ -105,9 +112,12 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
                                   " of the System has a length that is not a positive finite number");
     }
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
-    mayForcesChangeState = false;
-    for (int i = 0; i < system.getNumForces(); i++)
-        mayForcesChangeState = mayForcesChangeState || mayChangeState(system.getForce(i));
+    mayForcesChangePositions = mayForcesChangeVelocities = false;
+    for (int i = 0; i < system.getNumForces(); i++) {
+        const Reach reach = reachOf(system.getForce(i));
+        mayForcesChangePositions = mayForcesChangePositions || reach == FullReach;
+        mayForcesChangeVelocities = mayForcesChangeVelocities || reach != NoReach;
+    }
     systemFingerprint = VRattleRunState::fingerprintOf(system);
     dynamics.reset(new VRattleDynamics(masses, constraints));
     if (getPlatform().getName() != "Reference") { // which does everything on one thread
@@ -186,20 +196,24 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
         isStateChanged = true;
     // What the user changes we are told; a look at all positions and velocities is spent only where it may find something: where a
     // Force may have changed them, or another integrator (of a CompoundIntegrator) may have taken steps.
-    const bool mustCompare = mayForcesChangeState || isContextAhead || &context.getIntegrator() != &integrator;
+    const bool mustCompare = isContextAhead || &context.getIntegrator() != &integrator;
+    const bool mustComparePositions = mustCompare || mayForcesChangePositions;
+    const bool mustCompareVelocities = mustCompare || mayForcesChangeVelocities;
     try {
         if (isStateChanged)
             startAfresh(context);
-        else if (forcesInvalid || (mustCompare && differ(*data.positions, knownPositions()))) {
+        else if (forcesInvalid || (mustComparePositions && differ(*data.positions, knownPositions()))) {
             // A Force has changed the state (a barostat, say).
             isStateChanged = true;
             noteContext();
             double energy = computeForces(context);
             dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
         }
-        else if (mustCompare && differ(*data.velocities, knownVelocities())) {
-            noteContext();
-            dynamics->changeVelocities(*data.velocities);
+        else if (mustCompareVelocities && differ(*data.velocities, knownVelocities())) {
+            if (isContextAhead || !dynamics->changeFrame(*data.velocities)) {
+                noteContext();
+                dynamics->changeVelocities(*data.velocities);
+            }
         }
         isStateChanged = false;
     }

@@ -72,7 +72,7 @@ private:
     OpenMM::Vec3 boxVectors[3];
     int forceGroups, monitorForceGroup;
     bool areSettingsChanged, isStateChanged;
-    bool hasMassless, mayForcesChangeState;
+    bool hasMassless, mayForcesChangePositions, mayForcesChangeVelocities;
     // The method's state is on the constraints; the Context's may not be, and is left as the user or a Force has made it
     // until the next step is complete. Then these hold what the Context has.
     bool isContextAhead;

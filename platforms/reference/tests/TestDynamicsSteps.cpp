@@ -137,6 +137,57 @@ void testShapes(StepDensity::Update update) {
     }
 }
 
+// Without forces, all motion is the same in a frame that moves.
+void testChangedFrame() {
+    Example e;
+    makeExample(e, 2);
+    const vector<Vec3> noForces(e.masses.size());
+    auto takeFreeSteps = [&](VRattleDynamics& dynamics, int steps) {
+        double time = 0;
+        for (int i = 0; i < steps;) {
+            const double size = dynamics.step(INFINITY);
+            vector<Vec3> forces = noForces;
+            if (dynamics.finish(forces, 0)) {
+                time += size;
+                i++;
+            }
+        }
+        return time;
+    };
+    const Vec3 shift(0.3, -2, 0.7);
+    for (auto kind : {StepMonitor::ConstraintMultipliers, StepMonitor::VectorField}) {
+        VRattleDynamics resting(e.masses, e.constraints), moving(e.masses, e.constraints);
+        for (VRattleDynamics* dynamics : {&resting, &moving}) {
+            VRattleDynamics::Settings settings = makeSettings(StepDensity::SemiExplicit);
+            settings.terms[0].kind = kind;
+            settings.tolerance = 1e-12;
+            dynamics->setSettings(settings);
+            dynamics->begin(e.positions, e.velocities, noForces, 0);
+            takeFreeSteps(*dynamics, 20);
+        }
+        vector<Vec3> velocities = moving.getVelocities();
+        for (Vec3& v : velocities)
+            v += shift;
+        vector<Vec3> others = velocities;
+        others.back() += Vec3(0, 1e-9, 0);
+        ASSERT(!moving.changeFrame(others));
+        ASSERT_EQUAL_VEC(resting.getVelocities()[0], moving.getVelocities()[0], 0.0);
+        ASSERT(moving.changeFrame(velocities));
+        if (kind == StepMonitor::VectorField) { // which sees the frame
+            double square = 0;
+            for (size_t i = 0; i < velocities.size(); i++)
+                square += e.masses[i] * velocities[i].dot(velocities[i]);
+            ASSERT_EQUAL_TOL(std::sqrt(square), moving.getMonitorValues()[0], 1e-12);
+            continue;
+        }
+        const double time = takeFreeSteps(resting, 20);
+        ASSERT_EQUAL_TOL(time, takeFreeSteps(moving, 20), 1e-12);
+        ASSERT_EQUAL_TOL(resting.getDensity(), moving.getDensity(), 1e-10);
+        for (size_t i = 0; i < velocities.size(); i++)
+            ASSERT_EQUAL_VEC(resting.getPositions()[i] + shift * time, moving.getPositions()[i], 1e-11);
+    }
+}
+
 void testThreads() {
     // Enough waters, and an odd number of them, for the batches to be shared.
     Example e;
@@ -175,6 +226,7 @@ int main() {
         {"clusters of every shape, SemiExplicit", [] { testShapes(StepDensity::SemiExplicit); }},
         {"clusters of every shape, Explicit", [] { testShapes(StepDensity::Explicit); }},
         {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
+        {"another frame of reference", testChangedFrame},
         {"any number of threads", testThreads},
     });
 }
