@@ -18,7 +18,7 @@ PACKAGE_TOOLS := $(VENV)/.package-tools-installed
 PYTEST_ARGUMENTS ?=
 CXX_FILES = $(shell find openmmapi platforms serialization tests -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize python-test docs wheel sdist conda install format clean
+.PHONY: all demo test check-format cxx-test sanitize python-test docs pictures wheel sdist conda install format clean
 
 all: test
 
@@ -62,6 +62,10 @@ python-test: install $(TOOLS)
 docs: install $(DOCS_TOOLS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html."
+
+# The first picture of the README, drawn anew.
+pictures: install
+	$(BIN)/python docs/draw_pictures.py
 
 # test_package FILE FOLDER: install FILE into an environment of its own, and run the tests of FOLDER from outside of it.
 define test_package

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from .comparison import Comparison, IntegratorRun, envelope
+from .comparison import Comparison, envelope, two_digits
+from .measurement import IntegratorRun
 
 __all__ = ["draw_comparison", "save_comparison"]
 
@@ -37,7 +38,7 @@ def draw_comparison(comparison: Comparison, windows: int = 300) -> Figure:
         comparison: the runs to draw.
         windows: the number of windows across the picture.
     """
-    figure = Figure(figsize=(9.0, 6.2), dpi=110, layout="constrained")
+    figure = Figure(figsize=(9.0, 6.4), dpi=110, layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     product_colours = iter(_PRODUCT_COLOURS * 3)
     for run in comparison.runs:
@@ -45,13 +46,11 @@ def draw_comparison(comparison: Comparison, windows: int = 300) -> Figure:
         if len(run.series.times) > 1:
             _draw_run(top, bottom, comparison, run, colour, windows)
         else:
-            top.plot([], [], color=colour, label=f"{run.name} (failed)")
+            top.plot([], [], color=colour, label=_label(comparison, run))
     top.set_yscale("log")
-    top.set_ylim(bottom=_lower_limit(top))
+    top.set_ylim(bottom=_lower_limit(top, comparison))
     top.set_ylabel("energy error |E - E(0)|\n(kJ/mol)")
-    top.set_title(
-        f"{comparison.description}: about {comparison.force_evaluations:,} force evaluations each", fontsize=11
-    )
+    top.set_title(f"{comparison.description}\n{_what_is_equal(comparison)}", fontsize=11)
     bottom.set_yscale("log" if _step_range(comparison) > 5.0 else "linear")
     bottom.set_ylabel("step size (ps)")
     bottom.set_xlabel("time (ps)")
@@ -70,10 +69,33 @@ def save_comparison(comparison: Comparison, path: Path) -> None:
     draw_comparison(comparison).savefig(path)
 
 
-def _lower_limit(axes: Any) -> float | None:
-    """Where an axis of energy errors may begin: shades may reach below it, lines may not."""
+def _what_is_equal(comparison: Comparison) -> str:
+    """What all integrators were given."""
+    if comparison.wanted_error is not None:
+        return f"as many force evaluations as a largest energy error of {comparison.wanted_error:g} kJ/mol takes"
+    return f"about {comparison.force_evaluations:,} force evaluations each"
+
+
+def _label(comparison: Comparison, run: IntegratorRun) -> str:
+    """The name of a run and what came of it."""
+    if run.failure is not None:
+        return f"{run.name}: failed at {run.simulated_time:.3g} ps" if run.steps else f"{run.name}: failed"
+    if comparison.wanted_error is not None:
+        return f"{run.name}: {run.force_evaluations:,} evaluations"
+    return f"{run.name}: at most {two_digits(run.largest_energy_error)} kJ/mol"
+
+
+def _lower_limit(axes: Any, comparison: Comparison) -> float | None:
+    """Where an axis of energy errors may begin: below the lines, but not far below what the best run has at its worst.
+
+    Many begin at rounding, which would take half of the picture.
+    """
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.lines] or [np.array([])])
-    return float(values.min()) / 3.0 if len(values) else None
+    if not len(values):
+        return None
+    best = comparison.best()
+    floor = 1e-5 * best.largest_energy_error if best is not None else 0.0
+    return max(float(values.min()) / 3.0, floor)
 
 
 def _step_range(comparison: Comparison) -> float:
@@ -88,8 +110,7 @@ def _draw_run(top: Any, bottom: Any, comparison: Comparison, run: IntegratorRun,
     smallest = np.maximum(np.abs(reduced.smallest_energy_errors), _ENERGY_FLOOR)
     style: dict[str, Any] = {"color": colour} | _STYLES[run.method]
     order = style["zorder"]
-    label = run.name if run.failure is None else f"{run.name} (failed at {run.simulated_time:.3g} ps)"
-    top.plot(reduced.times, largest, label=label, **style)
+    top.plot(reduced.times, largest, label=_label(comparison, run), **style)
     top.fill_between(reduced.times, smallest, largest, color=colour, alpha=0.1, linewidth=0, zorder=order - 1.5)
     bottom.plot(reduced.times, reduced.smallest_steps, **style)
     bottom.fill_between(

@@ -13,9 +13,12 @@ import importlib
 import inspect
 import pkgutil
 import re
+import subprocess
+import sys
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import openmm
 import openmmvrattle
 import pytest
@@ -23,6 +26,7 @@ from markdown_it import MarkdownIt
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide
+from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -54,7 +58,7 @@ def fences(page: Path, language: str) -> list[tuple[int, str]]:
 
 def test_there_are_pages_and_snippets() -> None:
     assert {"README.md", "CHANGELOG.md"} < {page.name for page in PAGES}
-    assert sum(len(fences(page, "python")) for page in PAGES) >= 3
+    assert sum(len(fences(page, "python")) for page in PAGES) > 10
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if fences(page, "python")], ids=name_of)
@@ -132,3 +136,19 @@ def test_the_docstring_of_a_method_says_what_it_takes_returns_and_raises(name: s
             assert re.search(r"picoseconds|kJ/mol", returns[1]), "the result has no unit"
     else:
         assert not returns
+
+
+@pytest.mark.parametrize("picture", sorted(ROOT.glob("docs/images/*.png")), ids=name_of)
+def test_a_picture_is_small_and_shown(picture: Path) -> None:
+    assert picture.stat().st_size < 200_000
+    assert any(f"images/{picture.name})" in page.read_text(encoding="utf-8") for page in PAGES)
+
+
+def test_the_first_picture_can_be_drawn_anew(tmp_path: Path) -> None:
+    path = tmp_path / "picture.png"
+    subprocess.run([sys.executable, str(ROOT / "docs" / "draw_pictures.py"), "--output", str(path)], check=True)
+    with Image.open(path) as new, Image.open(ROOT / "docs" / "images" / "double-pendulum.png") as shown:
+        assert new.size == shown.size
+        difference = np.asarray(new.convert("L"), dtype=float) - np.asarray(shown.convert("L"), dtype=float)
+    # The motion is chaotic after the first whip, and fonts differ a little: the same picture, but not to the pixel.
+    assert np.mean(np.abs(difference) > 64) < 0.02
