@@ -30,8 +30,7 @@ demo: install
 test:
 	$(MAKE) check-format
 	$(MAKE) cxx-test
-	$(MAKE) python-test
-	$(MAKE) docs
+	$(MAKE) python-test docs
 
 check-format: $(TOOLS)
 	$(BIN)/ruff check .
