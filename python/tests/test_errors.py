@@ -201,6 +201,58 @@ def test_redundant_framework(platform: str) -> None:
     assert named_particles(str(caught.value)) == {3, 4, 5, 6, 7}, str(caught.value)
 
 
+FLAT_MONITORS = [None, "ConstraintMultipliers", "ConstraintForce", "ConstraintAndAppliedForce"]
+
+
+@pytest.mark.parametrize("monitor", FLAT_MONITORS)
+@pytest.mark.parametrize("missed_by", [0.0, 1e-7, 1e-5, 1e-3, 0.5])
+def test_run_into_a_flat_rhombus(missed_by: float, monitor: str | None, platform: str) -> None:
+    """Four equal rods, hinged into a ring of equal masses, fold together at a constant angular velocity.
+
+    Folded flat, all rods lie on one line and one of the four constraints says what the others say: there the multipliers
+    are not defined. A step of RATTLE turns the rods by exactly asin(h w), so the twentieth step ends at this angle times
+    missed_by beside the flat configuration. If that is too close the step fails and names the particles; if not the run
+    goes on through it. A shorter step after the failure goes on too.
+    """
+    step, turn, length = 0.001, 0.01, 1.0
+    angle, speed = (20 + missed_by) * turn, length * np.sin(turn) / step
+    axes = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
+    along = np.array([np.cos(angle), np.sin(angle)] * 2)[:, None]
+    across = np.array([np.sin(angle), -np.cos(angle)] * 2)[:, None]
+    system = openmm.System()
+    rods = [(0, 1), (1, 2), (2, 3), (3, 0)]
+    for _ in range(4):
+        system.addParticle(10)
+    for rod in rods:
+        system.addConstraint(*rod, length)
+    integrator = VariableStepRattleIntegrator(step)
+    integrator.clearMonitors()
+    if monitor:
+        integrator.addMonitor(getattr(VariableStepRattleIntegrator, monitor))
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+    context.setPositions(length * along * axes)
+    context.setVelocities(speed * across * axes)
+
+    def rod_errors() -> list[float]:
+        positions = positions_of(context)
+        return [abs(np.linalg.norm(positions[i] - positions[j]) / length - 1) for i, j in rods]
+
+    integrator.step(19)
+    if missed_by < 1e-4:
+        before = positions_of(context), velocities_of(context), time_of(context)
+        with pytest.raises(openmm.OpenMMException, match="redundant or nearly so") as caught:
+            integrator.step(1)
+        assert named_particles(str(caught.value)) == {0, 1, 2, 3}, str(caught.value)
+        assert np.array_equal(positions_of(context), before[0])
+        assert np.array_equal(velocities_of(context), before[1])
+        assert time_of(context) == before[2]
+        integrator.setStepSize(0.7 * step)
+    integrator.step(20)
+    assert max(rod_errors()) <= 1e-8  # false for a NaN
+    assert np.all(np.isfinite(velocities_of(context)))
+    assert positions_of(context)[1][1] < 0, "through the flat configuration"
+
+
 def named_particles(message: str) -> set[int]:
     """The numbers after the word particles in an error message."""
     found = re.search(r"particles((?:[ ,]|and|\d)+)", message)

@@ -32,7 +32,8 @@ private:
             text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
         if (particles.size() > maxListed)
             text += ", ... (" + std::to_string(particles.size()) + " in all)";
-        return text + " are redundant or nearly so in the current configuration; remove one of them";
+        return text + " are redundant or nearly so in the current configuration; remove one of them if they are so in "
+                      "every configuration";
     }
 };
 
