@@ -209,10 +209,10 @@ FLAT_MONITORS = [None, "ConstraintMultipliers", "ConstraintForce", "ConstraintAn
 def test_run_into_a_flat_rhombus(missed_by: float, monitor: str | None, platform: str) -> None:
     """Four equal rods, hinged into a ring of equal masses, fold together at a constant angular velocity.
 
-    Folded flat, all rods lie on one line and one of the four constraints says what the others say: there the multipliers
-    are not defined. A step of RATTLE turns the rods by exactly asin(h w), so the twentieth step ends at this angle times
-    missed_by beside the flat configuration. If that is too close the step fails and names the particles; if not the run
-    goes on through it. A shorter step after the failure goes on too.
+    Folded flat, all rods lie on one line and one of the four constraints says what the others say: there the
+    multipliers are not defined. A step of RATTLE turns the rods by exactly asin(h w), so the twentieth step ends at
+    this angle times missed_by beside the flat configuration. If that is too close the step fails and names the
+    particles; if not the run goes on through it. A shorter step after the failure goes on too.
     """
     step, turn, length = 0.001, 0.01, 1.0
     angle, speed = (20 + missed_by) * turn, length * np.sin(turn) / step
