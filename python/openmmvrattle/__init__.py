@@ -18,7 +18,7 @@ import openmm.version
 
 from . import _build
 
-__all__ = ["VariableStepRattleIntegrator", "XmlSerializer", "pluginLoadFailures"]
+__all__ = ["VariableStepRattleIntegrator", "XmlSerializer", "advise", "pluginLoadFailures"]
 __version__: str = _build.VERSION
 
 # The platforms that each of our libraries serves. The CPU platform runs the kernels of Reference.
@@ -69,3 +69,5 @@ from .vrattle import VariableStepRattleIntegrator  # noqa: E402
 
 # Found from the extension: in an editable install the Python files lie somewhere else.
 pluginLoadFailures: list[str] = _load_plugins(Path(_vrattle.__file__).parent / "lib" / "plugins")
+
+from .advice import advise  # noqa: E402 (it uses what is above)

@@ -11,8 +11,19 @@ from collections.abc import Sequence
 
 import openmm
 
-from .commands import compare
+from .commands import advise, compare, info
 from .commands.systems import UsageError
+
+_EXAMPLES = """examples:
+  python -m openmmvrattle info
+      does the installation work, and on which platforms?
+  python -m openmmvrattle advise --pdb protein.pdb
+      would variable steps pay on this system, and with which settings?
+  python -m openmmvrattle compare --system light-heavy-chain --output whip
+      integrators side by side: tables, pictures and a report in the folder whip
+
+  python -m openmmvrattle COMMAND --help shows all options of a command, with more examples.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,12 +48,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m openmmvrattle",
         description="Time-reversible variable-step dynamics with constraints for OpenMM.",
-        epilog=compare.EXAMPLES,
+        epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    compare.add_parser(commands)
+    for command in (compare, advise, info):
+        command.add_parser(commands)
     return parser
 
 

@@ -205,6 +205,8 @@ def make_integrator(control: StepControl, nominal_step_size: float | None = None
     integrator.clearMonitors()
     for monitor in control.monitors:
         integrator.addMonitor(getattr(VariableStepRattleIntegrator, monitor.kind), monitor.weight, monitor.power)
+    for index, value in enumerate(control.reference_values):
+        integrator.setReferenceMonitorValue(value, index)
     integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, control.update_method))
     integrator.setMinimumStepSize(control.smallest_step_ratio * nominal)
     integrator.setMaximumStepSize(control.largest_step_ratio * nominal)

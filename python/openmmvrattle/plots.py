@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from .advice import Advice
 from .comparison import Comparison, envelope, two_digits
 from .measurement import IntegratorRun
 
-__all__ = ["draw_comparison", "save_comparison"]
+__all__ = ["draw_comparison", "draw_trial", "save_comparison", "save_trial"]
 
 # Colours that can be told apart with any colour vision (Okabe and Ito).
 _COLOURS = {"fixed": "#E69F00", "variable": "#56B4E9", "control": "#555555"}
@@ -122,3 +123,58 @@ def _draw_run(top: Any, bottom: Any, comparison: Comparison, run: IntegratorRun,
         linewidth=0,
         zorder=order - 1.5,
     )
+
+
+def draw_trial(advice: Advice, description: str) -> Figure:
+    """Draw the energy error of a trial above the monitors along it, each relative to its mean.
+
+    Args:
+        advice: what the trial says.
+        description: of the system, for the title.
+    """
+    trial = advice.trial
+    figure = Figure(figsize=(9.0, 6.2), dpi=110, layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    windows = max(1, len(trial.times) // 2000)
+
+    def reduced(values: np.ndarray) -> np.ndarray:
+        """The largest of each few values, so that a long trial keeps its peaks."""
+        whole = len(values) // windows * windows
+        return values[:whole].reshape(-1, windows).max(axis=1)
+
+    times = reduced(trial.times)
+    top.plot(times, np.maximum(reduced(np.abs(trial.energy_errors)), _ENERGY_FLOOR), color=_COLOURS["control"])
+    top.set_yscale("log")
+    top.set_ylabel("energy error |E - E(0)|\n(kJ/mol)")
+    top.set_title(f"{description}: fixed steps of {trial.step_size:.4g} ps", fontsize=11)
+    best: dict[str, float] = {}
+    for candidate in advice.candidates:
+        kind = candidate.control.monitors[0].kind
+        best[kind] = max(best.get(kind, 0.0), candidate.predictor)
+    leading = sorted(best, key=lambda kind: -best[kind])[: len(_PRODUCT_COLOURS)]
+    for colour, kind in zip(_PRODUCT_COLOURS, leading, strict=False):
+        values = trial.monitor_values[kind]
+        label = f"{kind}, P up to {best[kind]:.2g}"
+        bottom.plot(times, reduced(values / values.mean()), color=colour, linewidth=1.2, label=label)
+    bottom.set_yscale("log")
+    bottom.set_ylabel("monitor U / mean U")
+    bottom.set_xlabel("time (ps)")
+    for axes in (top, bottom):
+        axes.grid(True, which="major", color="#dddddd", linewidth=0.6)
+        axes.set_axisbelow(True)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    if leading:
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9.5)
+    return figure
+
+
+def save_trial(advice: Advice, description: str, path: Path) -> None:
+    """Draw a trial and write it to a PNG file.
+
+    Args:
+        advice: what the trial says.
+        description: of the system, for the title.
+        path: the file.
+    """
+    draw_trial(advice, description).savefig(path)

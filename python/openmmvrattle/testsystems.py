@@ -73,6 +73,8 @@ class StepControl:
     """Name of the recursion of the step density, a class constant of the integrator."""
     calibration_steps: int = 0
     """Trial steps from which the reference value is taken (``calibrate``); 0 for the value at the first step."""
+    reference_values: tuple[float, ...] = ()
+    """Reference values of the monitors, in their units, if they are known beforehand."""
 
     @property
     def label(self) -> str:

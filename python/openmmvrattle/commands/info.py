@@ -1,0 +1,156 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The command ``info``: versions, platforms, and what is wrong with the installation."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import importlib.metadata
+import json
+import platform
+import re
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import openmm
+
+import openmmvrattle
+
+_PACKAGES = ("numpy", "matplotlib", "rich", "distributed", "pandas")
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        "info",
+        help="versions, platforms, and what is wrong with the installation",
+        description="Show versions, on which platforms the integrators run, and libraries that could not be loaded. "
+        "The exit status is 0 if the integrators run on all platforms that they are made for, and 1 otherwise.",
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("--json", action="store_true", help="write it as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Carry the command out and return the exit code."""
+    content = information()
+    if options.json:
+        print(json.dumps(content, indent=2))
+    else:
+        _print(content)
+    return 0 if content["healthy"] else 1
+
+
+def information() -> dict[str, Any]:
+    """Find out everything that the command shows."""
+    platforms = [openmm.Platform.getPlatform(index) for index in range(openmm.Platform.getNumPlatforms())]
+    found = {
+        each.getName(): {name: _problem(make, each) for name, make in _integrators().items()} for each in platforms
+    }
+    failures = {
+        "OpenMM-VRATTLE": list(openmmvrattle.pluginLoadFailures),
+        "OpenMM": list(openmm.Platform.getPluginLoadFailures()),
+    }
+    ours = "VariableStepRattleIntegrator"
+    promised = {name for names in openmmvrattle._PLATFORMS_OF_LIBRARY.values() for name in names}
+    works = "Reference" in found and all(found[name][ours] is None for name in promised & set(found))
+    return {
+        "healthy": works and not failures["OpenMM-VRATTLE"],
+        "versions": _versions(),
+        "platforms": found,
+        "plugin_load_failures": failures,
+        "folder": str(next(iter(openmmvrattle.__path__))),
+    }
+
+
+def _versions() -> dict[str, str]:
+    versions = {
+        "openmm-vrattle": openmmvrattle.__version__,
+        "built for OpenMM": openmmvrattle._build.OPENMM_VERSION,
+        "OpenMM": openmm.Platform.getOpenMMVersion(),
+        "Python": platform.python_version(),
+        "SWIG runtime": _swig_runtime(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def _swig_runtime() -> str:
+    """The SWIG runtimes in use: OpenMM's wrapper and ours understand each other if there is only one."""
+    found = sorted(re.findall(r"swig_runtime_data(\d+)", " ".join(sys.modules)))
+    return " and ".join(found) or "unknown"
+
+
+def _integrators() -> dict[str, Callable[[], openmm.Integrator]]:
+    """What can be tried on a platform."""
+    return {
+        name: functools.partial(getattr(openmmvrattle, name), 0.001)
+        for name in ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator")
+        if hasattr(openmmvrattle, name)
+    }
+
+
+def _problem(make: Callable[[], openmm.Integrator], on: openmm.Platform) -> str | None:
+    """Let two bonded particles take a step; None if they do, otherwise what OpenMM says."""
+    system = openmm.System()
+    for _ in range(2):
+        system.addParticle(1.0)
+    system.addConstraint(0, 1, 0.1)
+    try:
+        integrator = make()
+        context = openmm.Context(system, integrator, on)
+        context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+        context.setVelocities([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+        integrator.step(1)
+    except Exception as error:
+        return " ".join(str(error).split()) or type(error).__name__
+    return None
+
+
+def _print(content: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    versions = Table(title="Versions", title_justify="left", show_header=False)
+    for name, version in content["versions"].items():
+        versions.add_row(name, version)
+    console.print(versions)
+    platforms = Table(title="Where the integrators run", title_justify="left")
+    platforms.add_column("platform")
+    names = list(next(iter(content["platforms"].values()), {}))
+    for name in names:
+        platforms.add_column(name, overflow="fold")
+    for name, problems in content["platforms"].items():
+        platforms.add_row(name, *(_answer(problem) for problem in problems.values()))
+    console.print(platforms)
+    for whose, failures in content["plugin_load_failures"].items():
+        if failures:
+            console.print(f"Libraries of {whose} that could not be loaded:", style="bold")
+        for failure in failures:
+            console.print(f"- {' '.join(failure.split())}", soft_wrap=True, markup=False, highlight=False)
+        if failures and whose == "OpenMM":
+            console.print("They matter only for the platforms that they belong to.")
+    if content["healthy"]:
+        console.print("All is well.", style="bold green")
+    else:
+        console.print(
+            f"Something is wrong: install the package anew (pip install --force-reinstall openmm-vrattle); it lies in "
+            f"{content['folder']}.",
+            style="bold red",
+            soft_wrap=True,
+            markup=False,
+        )
+
+
+def _answer(problem: str | None) -> str:
+    from rich.markup import escape
+
+    return "[green]yes[/green]" if problem is None else f"no: {escape(problem)}"
