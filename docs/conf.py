@@ -45,7 +45,7 @@ nb_execution_raise_on_error = True
 # NumPy, matplotlib, OpenMM and the C++ standard library.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(openmm|unit|app|numpy|np|matplotlib|collections|pathlib|typing|rich|pandas)(\..*)?"),
+    ("py:.*", r"(openmm|unit|app|numpy|np|matplotlib|collections|os|pathlib|typing|rich|pandas)(\..*)?"),
     ("py:.*", r"(Any|Path|Callable|Sequence|Iterator|Figure|Quantity|Integrator|OpenMMException)"),
     ("py:.*", r"(bool|dict|float|int|list|None|object|str|tuple|type|TypeError|ValueError|optional)"),
     ("cpp:.*", r"(OpenMM|std)(::.*)?|string|vector|size_t"),

@@ -134,7 +134,7 @@ class Candidate:
     control: StepControl
     """The settings, with the nominal step that gives as many force evaluations as the trial had."""
     predictor: float
-    """P: by how much the largest error of the energy would shrink if steps followed the monitor at once."""
+    """P, by how much the largest error of the energy would shrink if steps followed the monitor at once."""
     largest_step: float
     """The largest step that the monitor would have asked for in the trial, ps."""
     smallest_step: float

@@ -107,7 +107,7 @@ class StepSizeReporter:
         if reportInterval != int(reportInterval) or reportInterval < 1:
             raise ValueError(f"The report interval is a number of steps, at least 1, and not {reportInterval}.")
         self.rows: list[dict[str, float]] = []
-        """The reports so far, if they are collected in memory: values by heading."""
+        """The reports so far, values by heading; empty if they go to a file or a stream."""
         self._interval = int(reportInterval)
         self._wanted = {
             "Step": step,
