@@ -86,9 +86,12 @@ def copy_notebook() -> None:
 
 
 def escape_plain_text(app, what, name, obj, options, lines) -> None:
-    """Our docstrings are plain text for `help()`: keep their |F|, x* and U_ from being read as markup."""
-    if name.startswith("openmmvrattle.VariableStepRattleIntegrator"):
-        lines[:] = [re.sub(r"\||\*(?!\*)|_(?=\W|$)", r"\\\g<0>", line) for line in lines]
+    """Docstrings are plain text for `help()`: keep |F| from being read as markup, and x* and U_ in those that SWIG has."""
+    swig = name.startswith("openmmvrattle.VariableStepRattleIntegrator")
+    markup = re.compile(r"\||\*(?!\*)|_(?=\W|$)" if swig else r"\|")
+    for i, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)
+        lines[i] = "".join(part if part.startswith("``") else markup.sub(r"\\\g<0>", part) for part in parts)
 
 
 def setup(app) -> None:
