@@ -86,7 +86,7 @@ def copy_notebook() -> None:
 
 
 def escape_plain_text(app, what, name, obj, options, lines) -> None:
-    """Docstrings are plain text for `help()`: keep |F| from being read as markup, and x* and U_ in those that SWIG has."""
+    """Docstrings are text for `help()`: keep |F| from being read as markup, and in the integrator's also x* and U_."""
     swig = name.startswith("openmmvrattle.VariableStepRattleIntegrator")
     markup = re.compile(r"\||\*(?!\*)|_(?=\W|$)" if swig else r"\|")
     for i, line in enumerate(lines):
