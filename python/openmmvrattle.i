@@ -199,6 +199,7 @@ def __init__(
     referenceMonitorValue: float | None = None,
     normOrder: float | None = None,
     monitorForceGroup: int | None = None,
+    automatic: bool | int = False,
 ) -> None:
     r"""
     Create a VariableStepRattleIntegrator. Apart from stepSize, every argument can be set later by the method of the same
@@ -226,7 +227,26 @@ def __init__(
         the order p of the monitors MultiplierPNorm and ForcePNorm. Default: 8
     monitorForceGroup : int
         the force group whose energy is the monitor ForceGroupEnergy. Default: 31
+    automatic : bool or int
+        whether the integrator chooses its steps by itself, see useAutomaticStepControl(); a number other than True is that
+        of the calibration steps. It excludes updateMethod, minimumStepSize, maximumStepSize, monitors and
+        referenceMonitorValue
+
+    Raises
+    ------
+    ValueError
+        if automatic is given together with an argument that it excludes
     """
+    excluded = {
+        "updateMethod": updateMethod,
+        "minimumStepSize": minimumStepSize,
+        "maximumStepSize": maximumStepSize,
+        "monitors": monitors,
+        "referenceMonitorValue": referenceMonitorValue,
+    }
+    for name, value in excluded.items():
+        if automatic and value is not None:
+            raise ValueError(f"automatic step control takes the place of {name}; give one of the two")
     _vrattle.VariableStepRattleIntegrator_swiginit(self, $action(_number(stepSize, "stepSize", _STEP_UNIT)))
     if updateMethod is not None:
         self.setUpdateMethod(updateMethod)
@@ -248,6 +268,10 @@ def __init__(
             self.addMonitor(*(monitor if isinstance(monitor, (list, tuple)) else (monitor,)))
     if referenceMonitorValue is not None:
         self.setReferenceMonitorValue(referenceMonitorValue)
+    if automatic is True:
+        self.useAutomaticStepControl()
+    elif automatic:
+        self.useAutomaticStepControl(automatic)
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNominalStepSize %{
@@ -508,6 +532,68 @@ def setMonitorForceGroup(self, group: int) -> None:
         if group does not lie between 0 and 31
     """
     $action(self, _integer(group, "group"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::useAutomaticStepControl %{
+def useAutomaticStepControl(self, calibrationSteps: int = 300) -> None:
+    r"""
+    Let the integrator choose its steps by itself: the setting for most uses. It takes steps of the nominal size while
+    nothing out of the ordinary happens, and shorter ones when something does, by two monitors of its own
+    (docs/automatic.md):
+
+     - 0, U_A, on each step: the size of the constraint and applied forces of the hardest clusters of particles, and of the
+       forces times the squared speeds, in nm amu^(1/2)/ps^2;
+     - 1, U_B, of each step between: from the change of the forces along it, the second time derivative of the potential
+       energy, in the same unit.
+
+    They take the place of the monitors, which are removed, and of the update and the bounds, which have no effect then: no
+    step is ever larger than 4/3 of the nominal one. clearMonitors() and addMonitor() end it. getMonitorValue(),
+    getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
+
+    The first step is preceded by a trial run of fixed steps of the nominal size from the state at that time, which leaves
+    the Context as it was. The geometric means of the monitors over it become their reference values, unless these have been
+    set. They stay in force when the state is changed later; calling this again, or calibrate(), takes new ones. Take
+    them where the forces are typical: a reference value that is too small makes steps shorter than they need be. Each start,
+    also after positions, velocities or parameters have been changed, takes two trial steps more. All trial steps
+    count as evaluations of the forces.
+
+    Parameters
+    ----------
+    calibrationSteps : int
+        the number of trial steps, at least 1
+
+    Raises
+    ------
+    OpenMMException
+        if calibrationSteps is not positive
+    """
+    $action(self, _integer(calibrationSteps, "calibrationSteps"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::isAutomatic %{
+def isAutomatic(self) -> bool:
+    r"""
+    Get whether the automatic step control is in use.
+
+    Returns
+    -------
+    bool
+        whether useAutomaticStepControl() was called, and neither clearMonitors() nor addMonitor() since
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getCalibrationSteps %{
+def getCalibrationSteps(self) -> int:
+    r"""
+    Get the number of trial steps of the automatic step control, as it was set last.
+
+    Returns
+    -------
+    int
+        the number of trial steps
+    """
+    return $action(self)
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNormOrder %{
@@ -819,6 +905,9 @@ public:
     %clear MonitorKind& kind;
     %clear double& weight;
     %clear double& power;
+    void useAutomaticStepControl(int calibrationSteps = 300);
+    bool isAutomatic() const;
+    int getCalibrationSteps() const;
     int getMonitorForceGroup() const;
     void setMonitorForceGroup(int group);
     double getNormOrder() const;

@@ -32,6 +32,8 @@ namespace {
 const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
 const double DEFAULT_MAXIMUM_FACTOR = 2.0;
 const double USE_DEFAULT = -1.0;
+const int DEFAULT_CALIBRATION_STEPS = 300;
+const int NUM_AUTOMATIC_MONITORS = 2;
 
 // Of the parameters that States hold; the settings among them have a version of their own.
 const int PARAMETERS_VERSION = 1;
@@ -92,8 +94,9 @@ void refuseDrudeParticles(ContextImpl& context) {
 
 VariableStepRattleIntegrator::VariableStepRattleIntegrator(double stepSize) :
         nominalStepSize(0), lastStepSize(0), minimumStepSize(USE_DEFAULT), maximumStepSize(USE_DEFAULT),
-        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8), reinitializationPhase(None),
-        numChangesAfterLoading(NUM_CHANGES_AFTER_LOADING) {
+        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8), automatic(false),
+        calibrationSteps(DEFAULT_CALIBRATION_STEPS), numAutomaticRequests(0), automaticReferences(),
+        reinitializationPhase(None), numChangesAfterLoading(NUM_CHANGES_AFTER_LOADING) {
     monitors.push_back({ConstraintMultipliers, 1.0, 1.0, 0.0});
     setNominalStepSize(stepSize);
     setConstraintTolerance(1e-8);
@@ -166,14 +169,42 @@ int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, do
         throw OpenMMException("VariableStepRattleIntegrator: there is no monitor of kind " + std::to_string(kind));
     requirePositive(weight, "weight of a monitor");
     requirePositive(power, "power of a monitor");
+    automatic = false;
     monitors.push_back({kind, weight, power, 0.0});
     settingsChanged();
     return (int) monitors.size() - 1;
 }
 
 void VariableStepRattleIntegrator::clearMonitors() {
+    automatic = false;
     monitors.clear();
     settingsChanged();
+}
+
+void VariableStepRattleIntegrator::useAutomaticStepControl(int steps) {
+    if (steps < 1)
+        throw OpenMMException("VariableStepRattleIntegrator: automatic step control needs at least one calibration "
+                              "step, not " +
+                              std::to_string(steps));
+    automatic = true;
+    calibrationSteps = steps;
+    numAutomaticRequests++;
+    for (double& reference : automaticReferences)
+        reference = 0;
+    monitors.clear();
+    settingsChanged();
+}
+
+bool VariableStepRattleIntegrator::isAutomatic() const {
+    return automatic;
+}
+
+int VariableStepRattleIntegrator::getCalibrationSteps() const {
+    return calibrationSteps;
+}
+
+int VariableStepRattleIntegrator::getNumAutomaticRequests() const {
+    return numAutomaticRequests;
 }
 
 int VariableStepRattleIntegrator::getNumMonitors() const {
@@ -212,37 +243,37 @@ void VariableStepRattleIntegrator::setNormOrder(double order) {
 }
 
 double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
-    checkMonitorIndex(index);
-    if (context == NULL || monitors[index].reference > 0)
-        return monitors[index].reference;
+    const double given = getSetReferenceMonitorValue(index);
+    if (context == NULL || given > 0)
+        return given;
     OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
     return stateful.getAs<IntegrateVRattleStepKernel>().getReferenceMonitorValue(*context, *this, index);
 }
 
 void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
-    checkMonitorIndex(index);
+    checkReferenceIndex(index);
     if (!(value >= 0) || !std::isfinite(value))
         throw OpenMMException(
             "VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
             "number, or 0 to take it at the first step");
-    monitors[index].reference = value;
+    (automatic ? automaticReferences[index] : monitors[index].reference) = value;
     settingsChanged();
 }
 
 double VariableStepRattleIntegrator::getSetReferenceMonitorValue(int index) const {
-    checkMonitorIndex(index);
-    return monitors[index].reference;
+    checkReferenceIndex(index);
+    return automatic ? automaticReferences[index] : monitors[index].reference;
 }
 
 void VariableStepRattleIntegrator::calibrate(int steps) {
     requireContext();
     if (steps < 1)
         throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs at least one trial step");
-    if (monitors.empty())
+    if (monitors.empty() && !automatic)
         throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs a monitor; add one with addMonitor()");
     vector<double> means = kernel.getAs<IntegrateVRattleStepKernel>().calibrate(*context, *this, steps);
-    for (size_t i = 0; i < monitors.size(); i++)
-        monitors[i].reference = means[i];
+    for (size_t i = 0; i < means.size(); i++)
+        (automatic ? automaticReferences[i] : monitors[i].reference) = means[i];
     settingsChanged();
 }
 
@@ -252,7 +283,7 @@ double VariableStepRattleIntegrator::getStepDensity() const {
 
 double VariableStepRattleIntegrator::getMonitorValue(int index) const {
     requireContext();
-    checkMonitorIndex(index);
+    checkReferenceIndex(index);
     OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
     return stateful.getAs<IntegrateVRattleStepKernel>().getMonitorValue(*context, *this, index);
 }
@@ -367,6 +398,9 @@ void VariableStepRattleIntegrator::copySettings(const VariableStepRattleIntegrat
     monitors = other.monitors;
     monitorForceGroup = other.monitorForceGroup;
     normOrder = other.normOrder;
+    automatic = other.automatic;
+    calibrationSteps = other.calibrationSteps;
+    std::copy(std::begin(other.automaticReferences), std::end(other.automaticReferences), automaticReferences);
     Integrator::setConstraintTolerance(other.getConstraintTolerance());
     setIntegrationForceGroups(other.getIntegrationForceGroups());
     settingsChanged();
@@ -467,6 +501,15 @@ void VariableStepRattleIntegrator::checkMonitorIndex(int index) const {
     if (index < 0 || index >= (int) monitors.size())
         throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
                               "; the integrator has " + std::to_string(monitors.size()));
+}
+
+// Of what has a value and a reference value: the monitors, or the two of automatic step control.
+void VariableStepRattleIntegrator::checkReferenceIndex(int index) const {
+    if (!automatic)
+        checkMonitorIndex(index);
+    else if (index < 0 || index >= NUM_AUTOMATIC_MONITORS)
+        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
+                              "; automatic step control has two, 0 and 1");
 }
 
 void VariableStepRattleIntegrator::checkBounds(double nominal, double minimum, double maximum) const {

@@ -15,8 +15,10 @@ using OpenMM::SerializationProxy;
 
 namespace {
 
-const int VERSION = 1;
+const int VERSION = 2; // 2: automatic step control
 const char MINIMUM_STEP[] = "minimumStepSize", MAXIMUM_STEP[] = "maximumStepSize";
+const char AUTOMATIC_CONTROL[] = "AutomaticStepControl";
+const char* const AUTOMATIC_REFERENCES[] = {"onStepReference", "halfStepReference"};
 
 } // namespace
 
@@ -46,6 +48,12 @@ void VariableStepRattleIntegratorProxy::serialize(const void* object, Serializat
         monitor.setIntProperty("kind", kind).setDoubleProperty("weight", weight).setDoubleProperty("power", power);
         monitor.setDoubleProperty("reference", integrator.getSetReferenceMonitorValue(i));
     }
+    if (integrator.isAutomatic()) {
+        SerializationNode& automatic = node.createChildNode(AUTOMATIC_CONTROL);
+        automatic.setIntProperty("calibrationSteps", integrator.getCalibrationSteps());
+        for (int k = 0; k < 2; k++)
+            automatic.setDoubleProperty(AUTOMATIC_REFERENCES[k], integrator.getSetReferenceMonitorValue(k));
+    }
 }
 
 void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& node) const {
@@ -72,6 +80,12 @@ void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& no
             integrator->addMonitor(kind, monitor.getDoubleProperty("weight"), monitor.getDoubleProperty("power"));
         integrator->setReferenceMonitorValue(monitor.getDoubleProperty("reference"), index);
     }
+    for (const SerializationNode& child : node.getChildren())
+        if (child.getName() == AUTOMATIC_CONTROL) {
+            integrator->useAutomaticStepControl(child.getIntProperty("calibrationSteps"));
+            for (int k = 0; k < 2; k++)
+                integrator->setReferenceMonitorValue(child.getDoubleProperty(AUTOMATIC_REFERENCES[k]), k);
+        }
     return integrator.release();
 }
 

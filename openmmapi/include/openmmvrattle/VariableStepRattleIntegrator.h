@@ -148,7 +148,10 @@ public:
      * @return the index of the monitor
      */
     int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0);
-    /** Remove all monitors. With none the step is fixed at the nominal size: plain RATTLE (3.1-3.5). */
+    /**
+     * Remove all monitors, and end automatic step control. With none the step is fixed at the nominal size: plain RATTLE
+     * (3.1-3.5).
+     */
     void clearMonitors();
     /** Get the number of monitors. */
     int getNumMonitors() const;
@@ -170,6 +173,35 @@ public:
      * @param group    the force group, between 0 and 31. Default: 31
      */
     void setMonitorForceGroup(int group);
+    /**
+     * Let the integrator choose its steps by itself: the setting for most uses. It takes steps of the nominal size while nothing
+     * out of the ordinary happens, and shorter ones when something does, by two monitors of its own (docs/automatic.md):
+     *
+     * - 0, U_A, on each step: the size of the constraint and applied forces of the hardest clusters of particles, and of
+     *   the forces times the squared speeds, in nm amu^(1/2)/ps^2;
+     * - 1, U_B, of each step between: from the change of the forces along it, the second time derivative of the potential
+     *   energy, in the same unit.
+     *
+     * They take the place of the monitors, which are removed, and of the update and the bounds, which have no effect
+     * then: no step is ever larger than 4/3 of the nominal one. clearMonitors() and addMonitor() end it. getMonitorValue(),
+     * getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
+     *
+     * The first step is preceded by a trial run of fixed steps of the nominal size from the state at that time, which
+     * leaves the Context as it was. The geometric means of the monitors over it become their reference values, unless
+     * these have been set. They stay in force when the state is changed later; calling this again, or calibrate(),
+     * takes new ones. Take them where the forces are typical: a reference value that is too small makes steps
+     * shorter than they need be. Each start, also after positions, velocities or parameters have been changed, takes two trial
+     * steps more. All trial steps count as evaluations of the forces.
+     *
+     * @param calibrationSteps    the number of trial steps, at least 1. Default: 300
+     */
+    void useAutomaticStepControl(int calibrationSteps = 300);
+    /** Get whether the automatic step control is in use. */
+    bool isAutomatic() const;
+    /** Get the number of trial steps of the automatic step control, as it was set last. */
+    int getCalibrationSteps() const;
+    /** Get how often useAutomaticStepControl() has been called. Used by the platforms. */
+    int getNumAutomaticRequests() const;
     /** Get the order p of the monitors MultiplierPNorm and ForcePNorm. */
     double getNormOrder() const;
     /**
@@ -197,7 +229,8 @@ public:
     /** Get the reference value that was set for a monitor; 0 if it is to be taken at the first step. */
     double getSetReferenceMonitorValue(int index) const;
     /**
-     * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size. The
+     * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size, or of the two of
+     * automatic step control to their geometric means. The
      * trial run starts at the current state of the Context, and everything but the reference values and the number of force
      * evaluations is put back as it was.
      *
@@ -283,6 +316,7 @@ private:
     void settingsChanged();
     void requireContext() const;
     void checkMonitorIndex(int index) const;
+    void checkReferenceIndex(int index) const;
     void checkBounds(double nominal, double minimum, double maximum) const;
     double advance(double maxTime);
     VRattleRunState saveRun() const;
@@ -295,6 +329,10 @@ private:
     std::vector<Monitor> monitors;
     int monitorForceGroup;
     double normOrder;
+    // Automatic step control: 0 trial steps while it is off; references as those of the monitors.
+    bool automatic;
+    int calibrationSteps, numAutomaticRequests;
+    double automaticReferences[2];
     OpenMM::Kernel kernel;
     // Context::reinitialize() writes a checkpoint, cleans up, and loads it: how far this has gone.
     enum ReinitializationPhase { None, CheckpointWritten, CleanedUp };

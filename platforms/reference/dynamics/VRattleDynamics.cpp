@@ -48,10 +48,10 @@ double dot(const vector<double>& a, const vector<double>& b) {
 } // namespace
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
-        system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), settings(), groupEnergy(0),
-        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0),
-        firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0),
-        kickNext(0), numIterations(0), numRescues(0), lastError(0) {
+        system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), automatic(system),
+        settings(), groupEnergy(0), rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0),
+        densityOffset(0), firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1),
+        stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -74,6 +74,7 @@ void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
+    const bool sameControl = takeAutomaticReferences(newSettings) && newSettings.isAutomatic == settings.isAutomatic;
     bool sameTerms = newSettings.terms.size() == settings.terms.size() && newSettings.normOrder == settings.normOrder &&
                      newSettings.isFixedStep == settings.isFixedStep;
     bool retakeReference = false;
@@ -88,7 +89,7 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     }
     if (!sameTerms)
         terms = newSettings.terms;
-    bool sameDensity = sameTerms && !retakeReference && newSettings.stepSize == settings.stepSize &&
+    bool sameDensity = sameTerms && sameControl && !retakeReference && newSettings.stepSize == settings.stepSize &&
                        newSettings.minimumStep == settings.minimumStep &&
                        newSettings.maximumStep == settings.maximumStep && newSettings.update == settings.update;
     for (size_t i = 0; i < terms.size() && sameDensity; i++)
@@ -102,12 +103,36 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     monitor.setForces(force, groupEnergy);
     monitor.evaluate(v, lambda, rightSide, values);
     rate = 0; // only the speed of convergence of the next step depends on it
-    if (!sameTerms || retakeReference)
+    if (settings.isAutomatic && !sameControl)
+        automatic.begin(v, force, lambda, rightSide);
+    if (!sameTerms || !sameControl || retakeReference)
         forgetDensity();
     else
         rescaleDensity(u);
     if (hasDensity)
         formHalfStepVelocities();
+}
+
+// Returns whether automatic step control has the references that it had.
+bool VRattleDynamics::takeAutomaticReferences(const Settings& newSettings) {
+    bool areSame = true;
+    for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++) {
+        const double given = newSettings.automaticReferences[k], old = automatic.getReference(k);
+        const bool isKept = newSettings.isAutomatic && settings.isAutomatic && settings.automaticReferences[k] == 0 &&
+                            newSettings.automaticRequest == settings.automaticRequest;
+        const double reference = given == 0 && isKept ? old : given;
+        areSame = areSame && reference == old;
+        automatic.setReference(k, reference);
+    }
+    return areSame;
+}
+
+void VRattleDynamics::setReferences(const vector<double>& references) {
+    for (size_t k = 0; k < references.size(); k++)
+        if (settings.isAutomatic)
+            automatic.setReference((int) k, references[k]);
+        else
+            monitor.setReference((int) k, references[k]);
 }
 
 // Whether the density is solved for together with the constraints, which takes u at half-step momenta.
@@ -123,7 +148,7 @@ void VRattleDynamics::forgetDensity() {
 
 // After a jump of the state: rho keeps its ratio to u, so that it starts no oscillation.
 void VRattleDynamics::rescaleDensity(double oldU) {
-    if (!hasDensity)
+    if (!hasDensity || settings.isAutomatic)
         return;
     u = combineAndLimit(values);
     if (u > 0 && oldU > 0)
@@ -317,13 +342,35 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
     evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
     isMonitorCurrent = true;
+    if (settings.isAutomatic)
+        automatic.begin(v, force, lambda, rightSide);
+}
+
+void VRattleDynamics::startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
+                                     const double (&secondBack)[AutomaticControl::NUM_MONITORS]) {
+    automatic.start(back, secondBack);
+    hasDensity = true;
+    rho = automatic.getLast();
+    formHalfStepVelocities();
 }
 
 VRattleDynamics::Memory VRattleDynamics::getMemory() const {
-    Memory memory = {hasDensity, rho,           w,    multiplierOffset, {}, lambda, values, hasHalfStepValue,
-                     u,          halfStepValue, rate, densityOffset};
-    for (const StepMonitor::Term& term : monitor.getTerms())
-        memory.references.push_back(term.reference);
+    Memory memory = {hasDensity,
+                     rho,
+                     w,
+                     multiplierOffset,
+                     {},
+                     lambda,
+                     values,
+                     hasHalfStepValue,
+                     u,
+                     halfStepValue,
+                     rate,
+                     densityOffset,
+                     automatic.getMemory()};
+    const size_t numReferences = settings.isAutomatic ? AutomaticControl::NUM_MONITORS : monitor.getTerms().size();
+    for (size_t k = 0; k < numReferences; k++)
+        memory.references.push_back(getReference((int) k));
     return memory;
 }
 
@@ -333,8 +380,9 @@ void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& 
     v = velocities; // begin() has projected them, which changes the last bits
     lambda = memory.multipliers;
     values = memory.monitorValues;
-    for (size_t k = 0; k < memory.references.size(); k++)
-        monitor.setReference((int) k, memory.references[k]);
+    setReferences(memory.references);
+    if (settings.isAutomatic)
+        automatic.setMemory(memory.automatic);
     hasDensity = memory.hasDensity;
     rho = memory.density;
     w = memory.halfStepVelocities;
@@ -350,12 +398,18 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
                                   const vector<Vec3>& forces, double energy) {
     const bool hadDensity = hasDensity;
     const double oldRho = rho, oldU = u;
+    const AutomaticControl::Memory oldControl = automatic.getMemory();
     begin(positions, velocities, forces, energy);
     if (!hadDensity)
         return;
     hasDensity = true;
     rho = oldRho;
     rescaleDensity(oldU);
+    if (settings.isAutomatic) {
+        automatic.setMemory(oldControl);
+        automatic.change(v, force, lambda, rightSide);
+        rho = automatic.getLast();
+    }
     if (hasDensity)
         formHalfStepVelocities();
 }
@@ -396,6 +450,9 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     values = valuesTrial;
     hasHalfStepValue = false;
     rescaleDensity(u);
+    // The density of the last step stays, for its kick is in w.
+    if (settings.isAutomatic)
+        automatic.change(v, force, lambda, rightSide);
 }
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
@@ -696,7 +753,7 @@ double VRattleDynamics::solveRegular() {
     const bool isFixed = settings.isFixedStep || monitor.isEmpty();
     bool isSolved;
     if (isFixed)
-        isSolved = solveWith(1);
+        isSolved = solveWith(settings.isAutomatic && !settings.isFixedStep ? automatic.getNext() : 1);
     else if (settings.update == StepDensity::Bounded)
         isSolved = solveWith(density.boundedUpdate(u, rho));
     else if (needsHalfStepValue())
@@ -727,7 +784,9 @@ void VRattleDynamics::throwNotConverged() const {
     }
     else
         reason << "the constraints could not be solved for (the iteration diverged)";
-    if (hasDensity && !monitor.isEmpty())
+    if (hasDensity && settings.isAutomatic)
+        reason << "; the step tried was of " << settings.stepSize / rhoNext << " ps";
+    else if (hasDensity && !monitor.isEmpty())
         reason << "; u = U/U_ref was " << u << " before the step and the last one tried was of "
                << settings.stepSize / rhoNext << " ps";
     throw StepFailure(reason.str());
@@ -742,6 +801,8 @@ double VRattleDynamics::step(double maxStep) {
         full = solveRegular();
     }
     else {
+        if (settings.isAutomatic && !settings.isFixedStep)
+            throw StepFailure("the automatic step control has not been started");
         stepKind = First;
         rhoNext = 1;
         const vector<StepMonitor::Term>& terms = monitor.getTerms();
@@ -780,7 +841,11 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
                    withHalfStep);
     if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
+    if (settings.isAutomatic)
+        automatic.measure(vNext, forces, lambdaOnStep, rightSideNext, wNext, stepNext, force);
     // From here on nothing fails.
+    if (settings.isAutomatic)
+        acceptAutomatic();
     if (stepKind == Regular)
         keepOffsets();
     hasHalfStepValue = withHalfStep;
@@ -815,6 +880,17 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     return true;
 }
 
+void VRattleDynamics::acceptAutomatic() {
+    if (settings.isFixedStep || !hasDensity)
+        automatic.acceptMeasured();
+    else if (stepKind == Regular)
+        automatic.acceptStep();
+    else {
+        automatic.acceptPartOfStep(std::min(1.0, stepNext * automatic.getNext() / settings.stepSize));
+        rhoNext = automatic.getLast();
+    }
+}
+
 void VRattleDynamics::reverse() {
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
@@ -824,6 +900,7 @@ void VRattleDynamics::reverse() {
         for (int i : movingParticles)
             w[i] = -wNext[i];
         rho = rhoNext;
+        automatic.reverse();
         rate = -rate;
         hasHalfStepValue = false;
     }

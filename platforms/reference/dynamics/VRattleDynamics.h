@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 #define OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 
+#include "AutomaticControl.h"
 #include "ClusterBatch.h"
 #include "ConstraintMatrix.h"
 #include "ConstraintSystem.h"
@@ -41,21 +42,26 @@ public:
         std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
         double normOrder;
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
+        // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
+        bool isAutomatic;
+        double automaticReferences[AutomaticControl::NUM_MONITORS];
+        int automaticRequest; // changes when references in force are to be forgotten
     };
 
     /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
     struct Memory {
         bool hasDensity;
-        double density;                               // rho[n-1/2]
+        double density; // rho[n-1/2]
         std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
-        std::vector<double> multiplierOffset;         // lambda[n-1] - Lambda[n-1], in internal order
-        std::vector<double> references;               // U_k,ref in force
+        std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1], in internal order
+        std::vector<double> references; // U_k,ref in force
         // What could be computed again but for the last bits, which decide whether a restart is exact:
         std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
         bool hasHalfStepValue;
         double u, halfStepValue; // u(q[n],p[n]), u(q[n],p[n-1/2])
-        double rate;             // the change of u along F - G^T Lambda
-        double densityOffset;    // what (3.14) and (3.15) differed by in the last step
+        double rate; // the change of u along F - G^T Lambda
+        double densityOffset; // what (3.14) and (3.15) differed by in the last step
+        AutomaticControl::Memory automatic; // of automatic step control
     };
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
@@ -95,10 +101,7 @@ public:
     void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                 const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
     /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
-    void setReferences(const std::vector<double>& references) {
-        for (size_t k = 0; k < references.size(); k++)
-            monitor.setReference((int) k, references[k]);
-    }
+    void setReferences(const std::vector<double>& references);
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
@@ -132,6 +135,17 @@ public:
      * @throws StepFailure    if the forces are not finite or the constraints have become dependent
      */
     bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Whether the next step continues a sequence of densities; if not, it is the first one. */
+    bool hasStarted() const {
+        return hasDensity;
+    }
+    /** The state and the references of automatic step control. */
+    const AutomaticControl& getAutomaticControl() const {
+        return automatic;
+    }
+    /** Start the densities of automatic step control; see AutomaticControl::start(). The references must be known. */
+    void startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
+                        const double (&secondBack)[AutomaticControl::NUM_MONITORS]);
     /** Turn time around, without a force. */
     void reverse();
 
@@ -166,9 +180,9 @@ public:
     const std::vector<double>& getMonitorValues() const {
         return values;
     }
-    /** U_k,ref, 0 while it is not known. */
+    /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
     double getReference(int index) const {
-        return monitor.getTerms()[index].reference;
+        return settings.isAutomatic ? automatic.getReference(index) : monitor.getTerms()[index].reference;
     }
     /** Lambda(q[n],p[n]) for the relative form of the constraints, in internal order. */
     const std::vector<double>& getMultipliers() const {
@@ -186,6 +200,8 @@ private:
     enum SolveResult { Converged, TooSlow, NotConverged, NotPositive };
     enum FactorScope { NoFactor, GeneralFactor, FullFactor };
     void requireConstraintsForMonitors() const;
+    bool takeAutomaticReferences(const Settings& newSettings);
+    void acceptAutomatic();
     void forgetDensity();
     void rescaleDensity(double oldU);
     double combineAndLimit(const std::vector<double>& monitorValues) const;
@@ -240,6 +256,7 @@ private:
     NewtonMatrix newtonMatrix;
     StepMonitor monitor;
     StepDensity density;
+    AutomaticControl automatic;
     Settings settings;
     std::vector<int> movingParticles;
     Parallel parallel; // empty: one thread
@@ -249,11 +266,11 @@ private:
     std::vector<OpenMM::Vec3> q, v, w, force;
     double groupEnergy, rho, u;
     std::vector<double> lambda, rightSide, values; // Lambda, K Lambda and U_k
-    std::vector<double> multiplierOffset;          // lambda[n-1] - Lambda[n-1]
+    std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1]
     bool hasDensity, hasHalfStepValue;
     double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
-    double densityOffset;       // what (3.14) and (3.15) differed by in the last step
-    double firstDensity;        // of the first step, once it is known; else 0
+    double densityOffset; // what (3.14) and (3.15) differed by in the last step
+    double firstDensity; // of the first step, once it is known; else 0
 
     // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
     FactorScope factorScope;

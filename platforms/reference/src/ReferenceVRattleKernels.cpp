@@ -44,6 +44,9 @@ namespace {
 const int NO_MONITOR_GROUP = -1;
 // Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
 const double FORCE_ROUNDING = 1e-4;
+// Trial steps of automatic step control: how often they are made shorter, and the ratio of densities from which on they are.
+const int MAX_HALVINGS = 8;
+const double START_ACCURACY = 1.1;
 
 [[noreturn]] void throwFailure(const std::string& what, double time, const std::string& reason,
                                const std::string& wayOut) {
@@ -120,6 +123,7 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
     }
     systemFingerprint = VRattleRunState::fingerprintOf(system);
     dynamics.reset(new VRattleDynamics(masses, constraints));
+    trial.reset();
     if (getPlatform().getName() != "Reference") { // which does everything on one thread
         auto runOnThreads = [this](const std::function<void(int)>& task) {
             data.threads.execute([&task](OpenMM::ThreadPool&, int thread) { task(thread); });
@@ -153,6 +157,11 @@ void ReferenceIntegrateVRattleStepKernel::readSettings(const VariableStepRattleI
     settings.update = (StepDensity::Update) integrator.getUpdateMethod();
     settings.normOrder = integrator.getNormOrder();
     settings.isFixedStep = false;
+    settings.isAutomatic = integrator.isAutomatic();
+    calibrationSteps = integrator.getCalibrationSteps();
+    settings.automaticRequest = integrator.getNumAutomaticRequests();
+    for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
+        settings.automaticReferences[k] = settings.isAutomatic ? integrator.getSetReferenceMonitorValue(k) : 0.0;
     settings.terms.clear();
     int group = NO_MONITOR_GROUP;
     for (int i = 0; i < integrator.getNumMonitors(); i++) {
@@ -316,6 +325,7 @@ double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context,
                                                     const VariableStepRattleIntegrator& integrator, bool forcesInvalid,
                                                     double maxTime) {
     prepare(context, integrator, forcesInvalid);
+    startAutomatic(context);
     const double maxStep = maxTime - data.time;
     double size;
     try {
@@ -341,6 +351,7 @@ double ReferenceIntegrateVRattleStepKernel::execute(ContextImpl& context,
 void ReferenceIntegrateVRattleStepKernel::reverse(ContextImpl& context,
                                                   const VariableStepRattleIntegrator& integrator) {
     prepare(context, integrator, false);
+    startAutomatic(context);
     try {
         dynamics->reverse();
     }
@@ -358,27 +369,22 @@ vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& conte
                                                               const VariableStepRattleIntegrator& integrator,
                                                               int steps) {
     prepare(context, integrator, false);
-    VRattleDynamics trial(masses, constraints);
+    if (settings.isAutomatic)
+        return findAutomaticReferences(context, steps);
     VRattleDynamics::Settings fixed = settings;
     fixed.isFixedStep = true;
     vector<double> means(settings.terms.size(), 0.0);
     try {
-        trial.setSettings(fixed);
-        trial.begin(dynamics->getPositions(), dynamics->getVelocities(), dynamics->getForces(),
-                    dynamics->getGroupEnergy());
+        VRattleDynamics& method = beginTrial(fixed, 1);
         for (int i = 0; i < steps; i++) {
-            advance(context, trial, std::numeric_limits<double>::infinity());
+            takeTrialStep(context, method);
             for (size_t k = 0; k < means.size(); k++)
-                means[k] += trial.getMonitorValues()[k] / steps;
+                means[k] += method.getMonitorValues()[k] / steps;
         }
     }
     catch (const StepFailure& failure) {
         putBack(context);
         throwFailure("calibrate()", data.time, failure.what(), "; the Context is unchanged: use a smaller step size");
-    }
-    catch (...) {
-        putBack(context);
-        throw;
     }
     putBack(context);
     for (size_t k = 0; k < means.size(); k++)
@@ -386,6 +392,125 @@ vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& conte
             throw OpenMMException("VariableStepRattleIntegrator: monitor " + std::to_string(k) +
                                   " is zero all along the trial run of calibrate(); choose another monitor");
     return means;
+}
+
+// A copy of the method that takes steps of its own from the current state, forward or backward in time.
+VRattleDynamics& ReferenceIntegrateVRattleStepKernel::beginTrial(const VRattleDynamics::Settings& trialSettings,
+                                                                 double direction) {
+    if (trial == nullptr)
+        trial.reset(new VRattleDynamics(masses, constraints));
+    trial->setSettings(trialSettings);
+    vector<Vec3> velocities = dynamics->getVelocities();
+    for (Vec3& v : velocities)
+        v *= direction;
+    trial->begin(dynamics->getPositions(), velocities, dynamics->getForces(), dynamics->getGroupEnergy());
+    return *trial;
+}
+
+// Puts the Context back if the forces cannot be computed; a StepFailure is left to the caller.
+void ReferenceIntegrateVRattleStepKernel::takeTrialStep(ContextImpl& context, VRattleDynamics& method) {
+    try {
+        advance(context, method, std::numeric_limits<double>::infinity());
+    }
+    catch (const StepFailure&) {
+        throw;
+    }
+    catch (...) {
+        putBack(context);
+        throw;
+    }
+}
+
+// Start automatic step control, if the run is not in the middle of a sequence of its steps.
+void ReferenceIntegrateVRattleStepKernel::startAutomatic(ContextImpl& context) {
+    if (!settings.isAutomatic || dynamics->hasStarted())
+        return;
+    if (!dynamics->getAutomaticControl().hasReferences()) {
+        vector<double> references = findAutomaticReferences(context, calibrationSteps);
+        for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
+            if (dynamics->getReference(k) > 0) // set by the user
+                references[k] = dynamics->getReference(k);
+        dynamics->setReferences(references);
+    }
+    startFromTrialSteps(context);
+}
+
+// The geometric means of the two monitors over a trial run of fixed steps. Where steps of the nominal size fail, shorter ones
+// must do.
+vector<double> ReferenceIntegrateVRattleStepKernel::findAutomaticReferences(ContextImpl& context, int steps) {
+    const int numMonitors = AutomaticControl::NUM_MONITORS;
+    VRattleDynamics::Settings fixed = settings;
+    fixed.isFixedStep = true;
+    for (int halvings = 0;; halvings++) {
+        vector<double> logarithms(numMonitors, 0.0);
+        double floor = 0; // the logarithm of what is zero but for rounding
+        try {
+            VRattleDynamics& method = beginTrial(fixed, 1);
+            const AutomaticControl& control = method.getAutomaticControl();
+            for (int i = 0; i < steps; i++) {
+                takeTrialStep(context, method);
+                const double negligible = control.getNegligibleValue(method.getVelocities());
+                floor += std::log(negligible) / steps;
+                for (int k = 0; k < numMonitors; k++)
+                    logarithms[k] += std::log(std::max(control.getMemory().values[k], negligible)) / steps;
+            }
+        }
+        catch (const StepFailure& failure) {
+            putBack(context);
+            if (halvings == MAX_HALVINGS)
+                throwFailure("the trial run of automatic step control", data.time, failure.what(),
+                             "; the Context is unchanged: use a smaller step size");
+            fixed.stepSize *= 0.5;
+            continue;
+        }
+        putBack(context);
+        vector<double> references;
+        for (double logarithm : logarithms) {
+            references.push_back(std::exp(logarithm));
+            if (!(references.back() > 0) || !(logarithm > floor + std::log(10)))
+                throw OpenMMException("VariableStepRattleIntegrator: in the trial run of the automatic step control "
+                                      "there is no force and nothing turns, so there is nothing to measure steps by; "
+                                      "take more trial steps with useAutomaticStepControl(), until something happens, "
+                                      "or call clearMonitors() for fixed steps");
+        }
+        return references;
+    }
+}
+
+// Two trial steps backwards start the sequences of densities. Their size is that of the first step, which only they tell.
+void ReferenceIntegrateVRattleStepKernel::startFromTrialSteps(ContextImpl& context) {
+    const int numMonitors = AutomaticControl::NUM_MONITORS;
+    const AutomaticControl& control = dynamics->getAutomaticControl();
+    VRattleDynamics::Settings fixed = settings;
+    fixed.isFixedStep = true;
+    double values[2][numMonitors];
+    double density = control.densityOf({control.getMemory().values[0], 0.0});
+    for (int tries = 0;; tries++) {
+        fixed.stepSize = settings.stepSize / density;
+        try {
+            VRattleDynamics& method = beginTrial(fixed, -1);
+            takeTrialStep(context, method);
+            std::copy_n(method.getAutomaticControl().getMemory().values, numMonitors, values[0]);
+            const double found = control.densityOf({control.getMemory().values[0], values[0][1]});
+            if (found > START_ACCURACY * density && tries < MAX_HALVINGS) {
+                density = found;
+                continue;
+            }
+            takeTrialStep(context, method);
+            std::copy_n(method.getAutomaticControl().getMemory().values, numMonitors, values[1]);
+            break;
+        }
+        catch (const StepFailure& failure) {
+            if (tries >= MAX_HALVINGS) {
+                putBack(context);
+                throwFailure("the start of automatic step control", data.time, failure.what(),
+                             "; the Context is unchanged: use a smaller step size");
+            }
+            density *= 2;
+        }
+    }
+    putBack(context);
+    dynamics->startAutomatic(values[0], values[1]);
 }
 
 unsigned long long ReferenceIntegrateVRattleStepKernel::getSystemFingerprint() const {
@@ -418,6 +543,13 @@ VRattleRunState ReferenceIntegrateVRattleStepKernel::saveRun(ContextImpl& contex
                         {"halfStepValue", {memory.halfStepValue}},
                         {"rate", {memory.rate}},
                         {"densityOffset", {memory.densityOffset}}};
+    if (settings.isAutomatic) {
+        const AutomaticControl::Memory& control = memory.automatic;
+        run.methodValues["automaticBehind"] = {std::begin(control.behind), std::end(control.behind)};
+        run.methodValues["automaticAhead"] = {std::begin(control.ahead), std::end(control.ahead)};
+        run.methodValues["automaticValues"] = {std::begin(control.values), std::end(control.values)};
+        run.methodValues["automaticForceSquares"] = control.forceSquares;
+    }
     run.forces = dynamics->getForces();
     run.groupEnergy = dynamics->getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
@@ -433,7 +565,8 @@ VRattleRunState ReferenceIntegrateVRattleStepKernel::saveRun(ContextImpl& contex
     return run;
 }
 
-VRattleDynamics::Memory ReferenceIntegrateVRattleStepKernel::memoryOf(const VRattleRunState& run) const {
+VRattleDynamics::Memory ReferenceIntegrateVRattleStepKernel::memoryOf(const VRattleRunState& run,
+                                                                      bool isAutomatic) const {
     const size_t numConstraints = dynamics->getConstraintSystem().getNumConstraints();
     VRattleDynamics::Memory memory = {};
     memory.hasDensity = run.getMethodValue("hasDensity") != 0;
@@ -442,26 +575,36 @@ VRattleDynamics::Memory ReferenceIntegrateVRattleStepKernel::memoryOf(const VRat
     memory.multiplierOffset = run.getMethodValues("multiplierOffset", numConstraints);
     memory.references = run.references;
     memory.multipliers = run.getMethodValues("multipliers", numConstraints);
-    memory.monitorValues = run.getMethodValues("monitorValues", run.references.size());
+    memory.monitorValues = run.getMethodValues("monitorValues", isAutomatic ? 0 : run.references.size());
     memory.hasHalfStepValue = run.getMethodValue("hasHalfStepValue") != 0;
     memory.u = run.getMethodValue("u");
     memory.halfStepValue = run.getMethodValue("halfStepValue");
     memory.rate = run.getMethodValue("rate");
     memory.densityOffset = run.getMethodValue("densityOffset");
+    if (isAutomatic) {
+        const size_t numMonitors = AutomaticControl::NUM_MONITORS;
+        AutomaticControl::Memory& control = memory.automatic;
+        std::copy_n(run.getMethodValues("automaticBehind", numMonitors).begin(), numMonitors, control.behind);
+        std::copy_n(run.getMethodValues("automaticAhead", numMonitors).begin(), numMonitors, control.ahead);
+        std::copy_n(run.getMethodValues("automaticValues", numMonitors).begin(), numMonitors, control.values);
+        control.forceSquares = run.getMethodValues("automaticForceSquares",
+                                                   dynamics->getAutomaticControl().getMemory().forceSquares.size());
+    }
     return memory;
 }
 
 void ReferenceIntegrateVRattleStepKernel::resumeRun(ContextImpl&, const VariableStepRattleIntegrator& integrator,
                                                     const VRattleRunState& run) {
     const bool isSameSystem = run.system == systemFingerprint;
+    const int numReferences = integrator.isAutomatic() ? AutomaticControl::NUM_MONITORS : integrator.getNumMonitors();
     if (isSameSystem)
-        run.requireSizes((int) masses.size(), integrator.getNumMonitors());
+        run.requireSizes((int) masses.size(), numReferences);
     VRattleDynamics::Memory memory = {};
     if (isSameSystem && !run.startsAfresh)
-        memory = memoryOf(run);
+        memory = memoryOf(run, integrator.isAutomatic());
     restored.reset();
     readSettings(integrator);
-    if ((int) run.references.size() == integrator.getNumMonitors())
+    if ((int) run.references.size() == numReferences)
         dynamics->setReferences(run.references);
     lastDensity = run.lastDensity;
     isContextAhead = false;
@@ -561,7 +704,8 @@ double ReferenceIntegrateVRattleStepKernel::getReferenceMonitorValue(ContextImpl
 double ReferenceIntegrateVRattleStepKernel::getMonitorValue(ContextImpl& context,
                                                             const VariableStepRattleIntegrator& integrator, int index) {
     prepare(context, integrator, false);
-    return dynamics->getMonitorValues()[index];
+    return settings.isAutomatic ? dynamics->getAutomaticControl().getMemory().values[index]
+                                : dynamics->getMonitorValues()[index];
 }
 
 vector<double> ReferenceIntegrateVRattleStepKernel::getMultipliers(ContextImpl& context,

@@ -50,8 +50,13 @@ private:
     void readSettings(const VariableStepRattleIntegrator& integrator);
     void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
     void startAfresh(OpenMM::ContextImpl& context);
-    VRattleDynamics::Memory memoryOf(const VRattleRunState& run) const;
+    VRattleDynamics::Memory memoryOf(const VRattleRunState& run, bool isAutomatic) const;
     void takeRestored(OpenMM::ContextImpl& context);
+    void startAutomatic(OpenMM::ContextImpl& context);
+    VRattleDynamics& beginTrial(const VRattleDynamics::Settings& trialSettings, double direction);
+    void takeTrialStep(OpenMM::ContextImpl& context, VRattleDynamics& method);
+    std::vector<double> findAutomaticReferences(OpenMM::ContextImpl& context, int steps);
+    void startFromTrialSteps(OpenMM::ContextImpl& context);
     bool areForcesAsRestored(OpenMM::ContextImpl& context);
     unsigned long long fingerprintOfContext() const;
     void noteContext();
@@ -69,6 +74,8 @@ private:
     unsigned long long systemFingerprint;
     std::unique_ptr<VRattleDynamics> dynamics;
     VRattleDynamics::Settings settings;
+    int calibrationSteps; // of automatic step control
+    std::unique_ptr<VRattleDynamics> trial; // takes trial steps, once they are needed
     OpenMM::Vec3 boxVectors[3];
     int forceGroups, monitorForceGroup;
     bool areSettingsChanged, isStateChanged;
