@@ -199,7 +199,7 @@ def __init__(
     referenceMonitorValue: float | None = None,
     normOrder: float | None = None,
     monitorForceGroup: int | None = None,
-    automatic: bool | int = False,
+    automatic: bool | None = None,
 ) -> None:
     r"""
     Create a VariableStepRattleIntegrator. Apart from stepSize, every argument can be set later by the method of the same
@@ -227,16 +227,17 @@ def __init__(
         the order p of the monitors MultiplierPNorm and ForcePNorm. Default: 8
     monitorForceGroup : int
         the force group whose energy is the monitor ForceGroupEnergy. Default: 31
-    automatic : bool or int
-        whether the integrator chooses its steps by itself, see useAutomaticStepControl(); a number other than True is that
-        of the calibration steps. It excludes updateMethod, minimumStepSize, maximumStepSize, monitors and
-        referenceMonitorValue
+    automatic : bool
+        whether the integrator chooses its steps by itself, see useAutomaticStepControl(); then updateMethod,
+        minimumStepSize, maximumStepSize, monitors and referenceMonitorValue must not be given
 
     Raises
     ------
     ValueError
-        if automatic is given together with an argument that it excludes
+        if automatic is True and one of the arguments is given that it takes the place of
     """
+    if automatic not in (None, True, False):
+        raise TypeError(f"automatic must be True or False, not {automatic!r}")
     excluded = {
         "updateMethod": updateMethod,
         "minimumStepSize": minimumStepSize,
@@ -268,10 +269,8 @@ def __init__(
             self.addMonitor(*(monitor if isinstance(monitor, (list, tuple)) else (monitor,)))
     if referenceMonitorValue is not None:
         self.setReferenceMonitorValue(referenceMonitorValue)
-    if automatic is True:
+    if automatic:
         self.useAutomaticStepControl()
-    elif automatic:
-        self.useAutomaticStepControl(automatic)
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNominalStepSize %{

@@ -156,9 +156,9 @@ inline void testXml() {
 inline void testBadXml() {
     Integrator_ integrator(0.002);
     const std::string xml = toXml(integrator);
-    assertThrows("version 7 of their format and this plugin reads version 1",
-                 [&] { fromXml(replaced(xml, "version=\"1\"", "version=\"7\"")); });
-    assertThrows("version 0", [&] { fromXml(replaced(xml, "version=\"1\"", "version=\"0\"")); });
+    assertThrows("version 7 of their format and this plugin reads version 2",
+                 [&] { fromXml(replaced(xml, "version=\"2\"", "version=\"7\"")); });
+    assertThrows("version 0", [&] { fromXml(replaced(xml, "version=\"2\"", "version=\"0\"")); });
     assertThrows("step size", [&] { fromXml(replaced(xml, "stepSize=\"", "stepSize=\"-")); });
     assertThrows("stepSize", [&] { fromXml(replaced(xml, "stepSize", "size")); });
     assertThrows("no monitor of kind 99", [&] { fromXml(replaced(xml, "kind=\"0\"", "kind=\"99\"")); });

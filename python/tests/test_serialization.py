@@ -191,7 +191,7 @@ def test_a_copy_keeps_subclass_and_attributes() -> None:
 
 def test_xml_names_its_version_and_a_newer_one_is_refused() -> None:
     xml = openmm.XmlSerializer.serialize(VariableStepRattleIntegrator(STEP))
-    newer = xml.replace('version="1"', 'version="12"')
+    newer = xml.replace('version="2"', 'version="12"')
     assert newer != xml
     for serializer in (openmm.XmlSerializer, openmmvrattle.XmlSerializer):
         with pytest.raises(openmm.OpenMMException, match="version 12 of their format and this plugin reads version 1"):

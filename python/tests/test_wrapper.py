@@ -92,6 +92,7 @@ def test_constructor_signature():
         "referenceMonitorValue",
         "normOrder",
         "monitorForceGroup",
+        "automatic",
     ]
     assert parameters["stepSize"].default is inspect.Parameter.empty
     assert all(parameter.default is None for name, parameter in parameters.items() if name != "stepSize")
@@ -116,6 +117,7 @@ def test_the_public_methods_are_those_of_the_interface():
         "addMonitor",
         "calibrate",
         "clearMonitors",
+        "getCalibrationSteps",
         "getMaximumStepSize",
         "getMinimumStepSize",
         "getMonitor",
@@ -132,6 +134,7 @@ def test_the_public_methods_are_those_of_the_interface():
         "getStepDensity",
         "getStepSize",
         "getUpdateMethod",
+        "isAutomatic",
         "reverse",
         "setConstraintTolerance",
         "setMaximumStepSize",
@@ -144,6 +147,7 @@ def test_the_public_methods_are_those_of_the_interface():
         "setUpdateMethod",
         "step",
         "stepTo",
+        "useAutomaticStepControl",
     }
 
 
@@ -155,6 +159,7 @@ def test_defaults_in_signatures():
     assert defaults(VariableStepRattleIntegrator.getReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.setReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.getMonitorValue) == {"index": 0}
+    assert defaults(VariableStepRattleIntegrator.useAutomaticStepControl) == {"calibrationSteps": 300}
 
 
 @pytest.mark.parametrize("name, value", [*UPDATE_METHODS.items(), *MONITOR_KINDS.items()])

@@ -16,7 +16,7 @@ namespace {
 // The powers of u_A and u_B, the length l (nm), where the dead zone ends, and the largest density that is asked for.
 const double POWERS[] = {2.0 / 3.0, 0.8};
 const double LENGTH = 0.0125;
-const double DEAD_ZONE = 1.5, LARGEST = 1000;
+const double DEAD_ZONE = 2, LARGEST = 1000;
 // a in f(x) = (x - a) - (1 - a)^2/(x - a): no step is longer than the nominal one divided by a.
 const double SMALLEST = 0.75;
 // Accelerations below this fraction of |v|^2/l are rounding.
@@ -34,13 +34,23 @@ double inverseOfF(double y) {
     return SMALLEST + (y > 0 ? 0.5 * (y + root) : 2 * one * one / (root - y));
 }
 
-// phi(u): nearly 1 for u below DEAD_ZONE, u/DEAD_ZONE far above it, and never above LARGEST.
+double sixteenthPower(double x) {
+    for (int i = 0; i < 4; i++)
+        x *= x;
+    return x;
+}
+
+double sixteenthRoot(double x) {
+    for (int i = 0; i < 4; i++)
+        x = std::sqrt(x);
+    return x;
+}
+
+// phi(u): 1 to 1e-6 for u below 0.4 DEAD_ZONE, u/DEAD_ZONE far above it, and never above LARGEST.
 double applyDeadZone(double u) {
-    const double x = std::min(u / DEAD_ZONE, 1e30); // whose eighth power does not overflow
-    const double squared = x * x, fourth = squared * squared;
-    const double raised = std::sqrt(std::sqrt(std::sqrt(1 + fourth * fourth)));
-    const double y = raised / LARGEST, ySquared = y * y;
-    return raised / std::sqrt(std::sqrt(std::sqrt(1 + ySquared * ySquared * ySquared * ySquared)));
+    const double x = std::min(u / DEAD_ZONE, 1e15); // whose sixteenth power does not overflow
+    const double raised = sixteenthRoot(1 + sixteenthPower(x));
+    return raised / sixteenthRoot(1 + sixteenthPower(raised / LARGEST));
 }
 
 // (sum x^4)^(1/8)
@@ -190,13 +200,16 @@ void AutomaticControl::start(const double (&back)[NUM_MONITORS], const double (&
 }
 
 void AutomaticControl::change(const vector<Vec3>& v, const vector<Vec3>& force, const vector<double>& multipliers,
-                              const vector<double>& rightSides) {
+                              const vector<double>& rightSides, double part) {
     const double before = target(OnStep, memory.values[OnStep]), halfStepValue = memory.values[HalfStep];
     begin(v, force, multipliers, rightSides);
     memory.values[HalfStep] = halfStepValue;
     const double shift = target(OnStep, memory.values[OnStep]) - before;
     memory.behind[OnStep] += shift;
     memory.ahead[OnStep] += shift;
+    for (int k = 0; k < NUM_MONITORS; k++)
+        for (double* each : {&memory.behind[k], &memory.ahead[k]})
+            *each += part * (target(k, memory.values[k]) - *each);
 }
 
 void AutomaticControl::reverse() {

@@ -95,9 +95,14 @@ public:
      * @param secondBack   U_A[-2] and U_B[-3/2]
      */
     void start(const double (&back)[NUM_MONITORS], const double (&secondBack)[NUM_MONITORS]);
-    /** Go on at a changed on-step state, arguments as in begin(): A moves by as much as its monitor asks for. */
+    /**
+     * Go on at a changed on-step state, other arguments as in begin(): A moves by as much as its monitor asks for, and so that
+     * changes again and again do not add up to an oscillation, both sequences are drawn towards their monitors.
+     *
+     * @param part    by which part of their distance, between 0 for a change that is mere rounding and 1
+     */
     void change(const std::vector<OpenMM::Vec3>& v, const std::vector<OpenMM::Vec3>& force,
-                const std::vector<double>& multipliers, const std::vector<double>& rightSides);
+                const std::vector<double>& multipliers, const std::vector<double>& rightSides, double part);
     /** Turn time around. */
     void reverse();
 

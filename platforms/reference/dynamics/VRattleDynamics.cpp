@@ -407,7 +407,7 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
     rescaleDensity(oldU);
     if (settings.isAutomatic) {
         automatic.setMemory(oldControl);
-        automatic.change(v, force, lambda, rightSide);
+        automatic.change(v, force, lambda, rightSide, 1.0);
         rho = automatic.getLast();
     }
     if (hasDensity)
@@ -440,8 +440,11 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     for (int i : movingParticles)
         change[i] = velocities[i] - v[i];
     projectVelocities(change);
+    double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
     for (int i : movingParticles) {
+        changeSquared += system.getMasses()[i] * change[i].dot(change[i]);
         v[i] += change[i];
+        speedSquared += system.getMasses()[i] * v[i].dot(v[i]);
         w[i] += change[i];
     }
     evaluateU(v);
@@ -452,7 +455,7 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     rescaleDensity(u);
     // The density of the last step stays, for its kick is in w.
     if (settings.isAutomatic)
-        automatic.change(v, force, lambda, rightSide);
+        automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
 }
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)

@@ -43,9 +43,9 @@ public:
         double normOrder;
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
         // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
-        bool isAutomatic;
-        double automaticReferences[AutomaticControl::NUM_MONITORS];
-        int automaticRequest; // changes when references in force are to be forgotten
+        bool isAutomatic = false;
+        double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
+        int automaticRequest = 0; // changes when references in force are to be forgotten
     };
 
     /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */

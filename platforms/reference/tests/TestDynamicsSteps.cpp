@@ -76,9 +76,16 @@ static bool takeStep(VRattleDynamics& dynamics) {
     return dynamics.finish(forces, 0);
 }
 
-static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
+static VRattleDynamics::Settings makeAutomaticSettings() {
+    // References far below the monitors' values, so that the density is not 1.
+    return {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {30, 20}, 0};
+}
+
+static void run(VRattleDynamics& dynamics, const Example& e, int steps, bool isAutomatic = false) {
     vector<Vec3> positions = e.positions;
     dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
+    if (isAutomatic)
+        dynamics.startAutomatic({120, 150}, {110, 140});
     for (int i = 0; i < steps; i++)
         while (!takeStep(dynamics)) {
         }
@@ -193,7 +200,9 @@ void testThreads() {
     Example e;
     for (int i = 0; i < 4001; i++)
         e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
-    for (auto update : {StepDensity::SemiExplicit, StepDensity::Explicit}) {
+    const VRattleDynamics::Settings all[] = {makeSettings(StepDensity::SemiExplicit),
+                                             makeSettings(StepDensity::Explicit), makeAutomaticSettings()};
+    for (const VRattleDynamics::Settings& settings : all) {
         vector<Vec3> positions;
         double density = 0;
         for (int numThreads : {1, 2, 3, 8}) {
@@ -207,8 +216,8 @@ void testThreads() {
                         task(thread);
                 },
                 numThreads);
-            dynamics.setSettings(makeSettings(update));
-            run(dynamics, e, 5);
+            dynamics.setSettings(settings);
+            run(dynamics, e, 5, settings.isAutomatic);
             ASSERT((calls > 0) == (numThreads > 1));
             if (numThreads == 1) {
                 positions = dynamics.getPositions();
@@ -217,6 +226,7 @@ void testThreads() {
             for (size_t i = 0; i < positions.size(); i++)
                 ASSERT_EQUAL_VEC(positions[i], dynamics.getPositions()[i], 0.0);
             ASSERT_EQUAL(density, dynamics.getDensity());
+            ASSERT(density != 1);
         }
     }
 }
