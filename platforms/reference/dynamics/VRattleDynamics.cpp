@@ -432,6 +432,8 @@ bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
         hasHalfStepValue = false;
         rescaleDensity(u);
     }
+    if (settings.isAutomatic)
+        automatic.change(v, force, lambda, rightSide, 0.0);
     return true;
 }
 
