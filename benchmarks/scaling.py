@@ -1,0 +1,150 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""How the cost of a step, the memory and the preparation grow with the number of constraints.
+
+Steps of our solver alone, without forces, for rigid waters, proteins with bonds to hydrogen and with all bonds fixed
+(many copies of one of 159 residues), and one polymer chain. Beside them, what OpenMM needs to prepare its own
+solver (CCMA) for a chain, which it does for every Context of the platforms Reference and CPU, with whatever integrator.
+
+A table and one JSON line a measurement are printed. `make scaling` builds the program solver.cpp and runs this.
+
+    python benchmarks/scaling.py --program FILE [--constraints 10000 100000 1000000] [--context 200000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import constraints as problems
+import numpy as np
+import openmm
+import rich.console
+import rich.table
+from openmm import app, unit
+
+
+def arrays_of(problem: problems.Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Masses, pairs, lengths and positions of a problem."""
+    system = problem.system
+    masses = [system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(system.getNumParticles())]
+    first, second, lengths = problems.constraint_arrays(system)
+    return np.array(masses), np.stack([first, second], axis=1), lengths, problem.positions
+
+
+def copies_of(problem: problems.Problem, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """As many copies of a problem side by side as have the number of constraints."""
+    masses, pairs, lengths, positions = arrays_of(problem)
+    copies = max(1, round(count / len(pairs)))
+    offsets = len(masses) * np.arange(copies)
+    edge = int(np.ceil(copies ** (1 / 3)))
+    places = np.stack([np.arange(copies) % edge, np.arange(copies) // edge % edge, np.arange(copies) // edge**2], axis=1)
+    return (
+        np.tile(masses, copies),
+        (pairs[None] + offsets[:, None, None]).reshape(-1, 2),
+        np.tile(lengths, copies),
+        (positions[None] + 5.0 * places[:, None, :]).reshape(-1, 3),
+    )
+
+
+# A system by the number of constraints.
+SYSTEMS = {
+    "water": lambda count: arrays_of(problems.water(count // 3)),
+    "protein-hbonds": lambda count: copies_of(problems.protein(app.HBonds), count),
+    "protein-allbonds": lambda count: copies_of(problems.protein(app.AllBonds), count),
+    "chain": lambda count: arrays_of(problems.chain(count)),
+}
+
+
+def measure(program: str, name: str, count: int, update: str) -> dict:
+    """Steps of one system, in a process of its own."""
+    masses, pairs, lengths, positions = SYSTEMS[name](count)
+    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+    speeds = np.sqrt(gas * problems.TEMPERATURE / masses)
+    velocities = np.random.default_rng(2).normal(size=positions.shape) * speeds[:, None]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "problem"
+        with path.open("wb") as file:
+            for array, kind in (
+                (np.array([len(masses), len(pairs)]), np.int64),
+                (masses, np.float64),
+                (pairs, np.int32),
+                (lengths, np.float64),
+                (positions, np.float64),
+                (velocities, np.float64),
+            ):
+                file.write(np.ascontiguousarray(array, dtype=kind).tobytes())
+        steps = max(3, 2_000_000 // len(pairs))
+        command = [program, str(path), str(problems.STEP), str(steps), "5", update]
+        output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    result = json.loads(output)
+    return {
+        "benchmark": "scaling",
+        "system": name,
+        "update": update,
+        **result,
+        "nanoseconds_per_constraint": 1e9 * result["step_seconds"] / result["constraints"],
+        "kilobytes_per_constraint": result["kilobytes"] / result["constraints"],
+    }
+
+
+def context_seconds(bonds: int) -> float:
+    """The time that OpenMM takes to create a Context of a chain with its own VerletIntegrator."""
+    problem = problems.chain(bonds)
+    integrator = openmm.VerletIntegrator(problems.STEP)
+    begin = time.perf_counter()
+    openmm.Context(problem.system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    return time.perf_counter() - begin
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--program", required=True, help="the program made from solver.cpp")
+    parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
+    parser.add_argument("--constraints", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
+    parser.add_argument("--update", nargs="+", choices=["Explicit", "SemiExplicit"], default=["Explicit"])
+    parser.add_argument("--context", type=int, default=0, help="bonds of a chain whose Context OpenMM is to create")
+    arguments = parser.parse_args()
+    table = rich.table.Table(title="A step of the solver alone, at 1e-8")
+    for column in ("system", "update", "constraints", "ns each", "growth", "kB each", "set up (s)", "updates", "error"):
+        table.add_column(column, justify="left" if column in ("system", "update") else "right")
+    for name in arguments.system:
+        for update in arguments.update:
+            first = None
+            for count in arguments.constraints:
+                result = measure(arguments.program, name, count, update)
+                first = first or result["nanoseconds_per_constraint"]
+                result["growth"] = result["nanoseconds_per_constraint"] / first
+                print(json.dumps(result), flush=True)
+                table.add_row(
+                    name,
+                    update,
+                    str(result["constraints"]),
+                    f"{result['nanoseconds_per_constraint']:.1f}",
+                    f"{result['growth']:.2f}",
+                    f"{result['kilobytes_per_constraint']:.2f}",
+                    f"{result['setup_seconds']:.2f}",
+                    f"{result['iterations_per_step']:.2f}",
+                    f"{result['error']:.1e}",
+                )
+    rich.console.Console(width=130).print(table)
+    if arguments.context:
+        ours = measure(arguments.program, "chain", arguments.context, "Explicit")
+        theirs = context_seconds(arguments.context)
+        result = {
+            "benchmark": "scaling-context",
+            "bonds": arguments.context,
+            "ours_seconds": ours["setup_seconds"],
+            "openmm_context_seconds": theirs,
+        }
+        print(json.dumps(result))
+        print(f"A chain of {arguments.context} bonds: ours {ours['setup_seconds']:.2f} s, OpenMM's Context {theirs:.1f} s")
+
+
+if __name__ == "__main__":
+    main()
