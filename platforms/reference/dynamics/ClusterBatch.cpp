@@ -89,6 +89,17 @@ public:
     int getSize() const override {
         return numClusters;
     }
+    int findCluster(int particle) const override {
+        int first = 0, end = numClusters; // by bisection
+        while (first < end) {
+            const int middle = (first + end) / 2;
+            if (particles[(size_t) middle * P] < particle)
+                first = middle + 1;
+            else
+                end = middle;
+        }
+        return std::min(numClusters, (first + PACK_SIZE - 1) / PACK_SIZE * PACK_SIZE);
+    }
     double solvePositions(const StepArrays& step, int first, int end, double tolerance, int& iterations) const override;
     double coupledPass(const StepArrays& step, int first, int end) const override;
     double finish(const OnStepArrays& step, int first, int end) const override;

@@ -54,6 +54,11 @@ public:
     /** The number of clusters. */
     virtual int getSize() const = 0;
     /**
+     * The first cluster whose first particle is not before a given one, rounded up to a multiple of PACK_SIZE. Clusters are in the
+     * order of their first particles.
+     */
+    virtual int findCluster(int particle) const = 0;
+    /**
      * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by chord iterations, each cluster as
      * many as it needs.
      *

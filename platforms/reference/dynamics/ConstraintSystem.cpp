@@ -15,6 +15,13 @@ using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
+namespace {
+
+// The number of particles of a block, whose positions, velocities and forces take 150 kB.
+const int BLOCK_SIZE = 1024;
+
+} // namespace
+
 ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<DistanceConstraint>& given) :
         numGivenConstraints((int) given.size()), masses(masses), inverseMasses(masses.size()) {
     for (size_t i = 0; i < masses.size(); i++)
@@ -29,11 +36,10 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
                    std::tie(other.numParticles, other.inverseMasses, other.lengths);
         }
     };
-    struct Members {
-        vector<vector<int>> clusters;
-        vector<int> particles;
+    struct Member {
+        vector<int> constraints, particles;
     };
-    std::map<Shape, Members> shapes;
+    std::map<Shape, vector<Member>> shapes;
     vector<vector<int>> general;
     vector<char> isInBatch(masses.size(), false);
     for (vector<int>& cluster : findClusters(given)) {
@@ -60,23 +66,28 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
             isInBatch[i] = true;
             shape.inverseMasses.push_back(inverseMasses[i]);
         }
-        Members& batch = shapes[shape];
-        batch.particles.insert(batch.particles.end(), particles.begin(), particles.end());
-        batch.clusters.push_back(arranged);
+        shapes[shape].push_back({arranged, particles});
     }
-    for (const auto& entry : shapes) {
+    for (auto& entry : shapes) {
         const Shape& shape = entry.first;
+        vector<Member>& members = entry.second;
+        std::sort(members.begin(), members.end(),
+                  [](const Member& a, const Member& b) { return a.particles[0] < b.particles[0]; });
         const int first = (int) constraints.size(), numBonds = (int) shape.lengths.size();
-        for (const vector<int>& cluster : entry.second.clusters)
-            appendCluster(given, cluster);
+        vector<int> particles;
+        for (const Member& member : members) {
+            appendCluster(given, member.constraints);
+            particles.insert(particles.end(), member.particles.begin(), member.particles.end());
+        }
         batches.push_back(ClusterBatch::create(numBonds, numBonds == 3 && shape.numParticles == 3, shape.inverseMasses,
-                                               shape.lengths, entry.second.particles, first));
+                                               shape.lengths, particles, first));
     }
     firstGeneral = (int) constraints.size();
     for (const vector<int>& cluster : general)
         appendCluster(given, cluster);
     findCouplings();
     classifyParticles(isInBatch);
+    findBlocks();
     isFreeToTranslate = std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
         return inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0;
     });
@@ -210,6 +221,17 @@ void ConstraintSystem::classifyParticles(const vector<char>& isInBatch) {
     for (int i = 0; i < getNumParticles(); i++)
         if (inverseMasses[i] > 0 && !isInBatch[i])
             (isGeneral[i] ? generalParticles : freeParticles).push_back(i);
+}
+
+void ConstraintSystem::findBlocks() {
+    for (int particle = 0; particle < getNumParticles() + BLOCK_SIZE; particle += BLOCK_SIZE) {
+        Block block;
+        for (const auto& batch : batches)
+            block.clusters.push_back(batch->findCluster(particle));
+        const auto place = std::lower_bound(freeParticles.begin(), freeParticles.end(), particle);
+        block.freeParticle = (int) (place - freeParticles.begin());
+        blocks.push_back(block);
+    }
 }
 
 void ConstraintSystem::findCouplings() {

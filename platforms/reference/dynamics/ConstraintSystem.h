@@ -38,6 +38,14 @@ public:
     struct Cluster {
         int first, size;
     };
+    /**
+     * Where a block of neighbouring particles begins in the lists that are worked through block by block, so that what
+     * belongs together is in the processor's caches together.
+     */
+    struct Block {
+        std::vector<int> clusters; // the first cluster of each batch; a multiple of PACK_SIZE
+        int freeParticle;          // the first in getFreeParticles()
+    };
     /** Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column). */
     struct Coupling {
         int row, column; // row >= column
@@ -80,6 +88,10 @@ public:
     /** The batches of small clusters, whose constraints come first in the internal order. */
     const std::vector<std::unique_ptr<ClusterBatch>>& getBatches() const {
         return batches;
+    }
+    /** The beginnings of the blocks, and at last the end of all. */
+    const std::vector<Block>& getBlocks() const {
+        return blocks;
     }
     /** The first constraint that is in no batch. */
     int getFirstGeneral() const {
@@ -135,6 +147,7 @@ private:
     void appendCluster(const std::vector<DistanceConstraint>& given, const std::vector<int>& cluster);
     void findCouplings();
     void classifyParticles(const std::vector<char>& isInBatch);
+    void findBlocks();
     int numGivenConstraints, firstGeneral;
     bool isFreeToTranslate;
     std::vector<double> masses, inverseMasses;
@@ -144,6 +157,7 @@ private:
     std::vector<Cluster> clusters;
     std::vector<Coupling> couplings;
     std::vector<std::unique_ptr<ClusterBatch>> batches;
+    std::vector<Block> blocks;
     std::vector<int> generalParticles, freeParticles;
 };
 

@@ -222,17 +222,16 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                  rightSideHalf.data(),
                                  lambdaRate.data(),
                                  kick};
+    const vector<double>& inverseMasses = system.getInverseMasses();
     const BatchResult pivots = runBatches(
-        false, [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.finish(arrays, begin, end); });
+        false, [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.finish(arrays, begin, end); },
+        [&](int i) { velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]); });
     if (!(pivots.extreme > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
         // The general way knows how to name the cluster.
         system.evaluateJacobian(positions, jacobianNext);
         matrix.factorize(jacobianNext);
     }
     evaluateOnStepGeneral(arrays, positions, halfStep, forces, velocities, multipliers, rightSides);
-    const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i : system.getFreeParticles())
-        velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]);
     monitor.setForces(forces, energy);
     if (!monitor.hasFiniteForces())
         throw StepFailure("the force on a particle is infinite or not a number");
@@ -473,20 +472,27 @@ void VRattleDynamics::formHalfStepVelocities() {
 
 // ------------------------------------------------------------------------------------------ the equations of a step
 
-// Run a task on all batches: task(batch, first cluster, end, iterations). Each thread takes one piece of every batch, which begins
-// at a whole pack, so that every cluster is worked on in the same lane whatever the number of threads.
-template <class Task> VRattleDynamics::BatchResult VRattleDynamics::runBatches(bool largest, const Task& task) {
+// Run a task on all batches, task(batch, first cluster, end, iterations), and another on all particles without constraints,
+// freeTask(particle), block by block. Each thread takes its share of the blocks. A cluster is worked on in the same lane of a pack
+// whatever the number of threads, since blocks begin at whole packs.
+template <class Task, class FreeTask>
+VRattleDynamics::BatchResult VRattleDynamics::runBatches(bool largest, const Task& task, const FreeTask& freeTask) {
+    const auto& batches = system.getBatches();
+    const auto& blocks = system.getBlocks();
+    const vector<int>& freeParticles = system.getFreeParticles();
     auto runShare = [&](int thread, int numThreads) {
         BatchResult result = {largest ? 0.0 : std::numeric_limits<double>::infinity(), 0};
-        for (const auto& batch : system.getBatches()) {
-            const int numPacks = (batch->getSize() + PACK_SIZE - 1) / PACK_SIZE;
-            const int begin = PACK_SIZE * (int) ((long long) numPacks * thread / numThreads);
-            const int end =
-                std::min(batch->getSize(), PACK_SIZE * (int) ((long long) numPacks * (thread + 1) / numThreads));
-            if (begin < end) {
-                const double number = task(*batch, begin, end, result.iterations);
-                result.extreme = largest ? larger(result.extreme, number) : -larger(-result.extreme, -number);
+        const size_t numBlocks = blocks.size() - 1, end = numBlocks * (thread + 1) / numThreads;
+        for (size_t b = numBlocks * thread / numThreads; b < end; b++) {
+            for (size_t k = 0; k < batches.size(); k++) {
+                const int first = blocks[b].clusters[k], last = blocks[b + 1].clusters[k];
+                if (first < last) {
+                    const double number = task(*batches[k], first, last, result.iterations);
+                    result.extreme = largest ? larger(result.extreme, number) : -larger(-result.extreme, -number);
+                }
             }
+            for (int k = blocks[b].freeParticle; k < blocks[b + 1].freeParticle; k++)
+                freeTask(freeParticles[k]);
         }
         return result;
     };
@@ -536,23 +542,22 @@ void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, doubl
     }
 }
 
-void VRattleDynamics::moveFreeParticles(const vector<Vec3>& start, double kick, double drift) {
-    const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i : system.getFreeParticles()) {
-        wNext[i] = start[i] + force[i] * (kick * inverseMasses[i]);
-        qNext[i] = q[i] + wNext[i] * drift;
-    }
+void VRattleDynamics::moveFreeParticle(int i, const vector<Vec3>& start, double kick, double drift) {
+    wNext[i] = start[i] + force[i] * (kick * system.getInverseMasses()[i]);
+    qNext[i] = q[i] + wNext[i] * drift;
 }
 
 // Solve g(q+) = 0 (3.11) for lambda, with given kick and drift, by chord iterations with A = -kick drift K(q).
 bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift, double margin) {
     startMultipliers(margin == REGULAR_MARGIN);
-    moveFreeParticles(start, kick, drift);
     const StepArrays arrays = stepArrays(start, kick, drift);
     const double tolerance = margin * settings.tolerance;
-    BatchResult result = runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
-        return batch.solvePositions(arrays, begin, end, tolerance, iterations);
-    });
+    BatchResult result = runBatches(
+        true,
+        [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
+            return batch.solvePositions(arrays, begin, end, tolerance, iterations);
+        },
+        [&](int i) { moveFreeParticle(i, start, kick, drift); });
     lastError = larger(result.extreme, solveGeneral(start, kick, drift, tolerance, result.iterations));
     numIterations += result.iterations;
     return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
@@ -639,11 +644,11 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
         const StepArrays arrays = stepArrays(w, kick, drift);
-        const BatchResult result = runBatches(true, [&](const ClusterBatch& batch, int begin, int end, int&) {
-            return batch.coupledPass(arrays, begin, end);
-        });
+        const BatchResult result = runBatches(
+            true,
+            [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.coupledPass(arrays, begin, end); },
+            [&](int i) { moveFreeParticle(i, w, kick, drift); });
         lastError = larger(result.extreme, coupledPassGeneral(kick, drift));
-        moveFreeParticles(w, kick, drift);
         monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
         const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),

@@ -226,13 +226,14 @@ private:
         double extreme;
         int iterations;
     };
-    template <class Task> BatchResult runBatches(bool largest, const Task& task);
+    template <class Task, class FreeTask>
+    BatchResult runBatches(bool largest, const Task& task, const FreeTask& freeTask);
 
     StepArrays stepArrays(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     void startMultipliers(bool withOffset);
     void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift,
                       const std::vector<int>& particles, int first);
-    void moveFreeParticles(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    void moveFreeParticle(int i, const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double margin);
     double solveGeneral(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double tolerance,
                         int& iterations);
