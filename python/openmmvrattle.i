@@ -353,7 +353,8 @@ def getMinimumStepSize(self) -> unit.Quantity:
 def setMinimumStepSize(self, size: float | unit.Quantity) -> None:
     r"""
     Set the smallest step size the monitor can ask for. With the sum updates SemiExplicit and Explicit, rho oscillates
-    slightly about u and steps may leave the bounds by as much. Default: 1/50 of the nominal step size.
+    slightly about u and steps may leave the bounds by as much; where the motion is not resolved they may leave them by
+    more. Default: 1/50 of the nominal step size.
 
     Parameters
     ----------
@@ -385,7 +386,8 @@ def getMaximumStepSize(self) -> unit.Quantity:
 def setMaximumStepSize(self, size: float | unit.Quantity) -> None:
     r"""
     Set the largest step size the monitor can ask for; see setMinimumStepSize(). With the update Bounded no step is ever
-    larger. Default: twice the nominal step size.
+    larger, with the others a step of more than twice the bound is rescued (see getNumRescues()). Default: twice the
+    nominal step size.
 
     Parameters
     ----------

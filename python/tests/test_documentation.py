@@ -117,6 +117,12 @@ def test_every_public_name_has_a_docstring(module: object) -> None:
                 assert member.__doc__, f"{name}.{member_name} has no docstring"
 
 
+@pytest.mark.parametrize("module", [module for module in MODULES if hasattr(module, "__all__")], ids=name_of)
+def test_a_module_is_in_the_reference(module: object) -> None:
+    reference = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    assert re.search(rf"auto(module|class):: {re.escape(module.__name__)}\b", reference)
+
+
 @pytest.mark.parametrize("name", sorted(set(public_members(VariableStepRattleIntegrator)) - {"thisown"}))
 def test_the_docstring_of_a_method_says_what_it_takes_returns_and_raises(name: str) -> None:
     method = public_members(VariableStepRattleIntegrator)[name]
