@@ -4,6 +4,7 @@
 #include "openmmvrattle/VRattleRunState.h"
 #include "openmm/OpenMMException.h"
 #include "openmmvrattle/Fingerprint.h"
+#include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include <istream>
 #include <ostream>
 #include <string>
@@ -74,7 +75,8 @@ void readArray(const SerializationNode& node, const string& name, vector<Vec3>& 
 
 } // namespace
 
-unsigned long long VRattleRunState::fingerprintOf(const OpenMM::System& system) {
+unsigned long long VRattleRunState::fingerprintOf(const OpenMM::System& system,
+                                                  const VariableStepRattleIntegrator& integrator) {
     Fingerprint fingerprint;
     for (int i = 0; i < system.getNumParticles(); i++)
         fingerprint.add(system.getParticleMass(i));
@@ -83,6 +85,17 @@ unsigned long long VRattleRunState::fingerprintOf(const OpenMM::System& system) 
         double distance;
         system.getConstraintParameters(i, particle1, particle2, distance);
         fingerprint.add(Vec3(particle1, particle2, distance));
+    }
+    for (int i = 0; i < integrator.getNumExpressionConstraints(); i++) {
+        string expression;
+        vector<int> particles;
+        std::map<string, double> parameters;
+        integrator.getExpressionConstraintParameters(i, expression, particles, parameters);
+        fingerprint.addBytes(expression.c_str(), expression.size() + 1);
+        for (int particle : particles)
+            fingerprint.add(particle);
+        for (const auto& parameter : parameters)
+            fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
     }
     return fingerprint.get();
 }

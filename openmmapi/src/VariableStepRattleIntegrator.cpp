@@ -3,10 +3,12 @@
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "CheckpointBlock.h"
+#include "ExpressionCheck.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
 #include "openmm/internal/ContextImpl.h"
 #include "openmm/internal/ForceImpl.h"
+#include "openmm/reference/ReferencePlatform.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/XmlSerializer.h"
 #include "openmmvrattle/VRattleKernels.h"
@@ -88,6 +90,11 @@ void refuseDrudeParticles(ContextImpl& context) {
                                   "an integrator made for them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
                                   "DrudeLangevinIntegrator, or a force field without Drude particles");
     }
+}
+
+bool haveSameNames(const std::map<string, double>& a, const std::map<string, double>& b) {
+    return a.size() == b.size() &&
+           std::equal(a.begin(), a.end(), b.begin(), [](const auto& x, const auto& y) { return x.first == y.first; });
 }
 
 } // namespace
@@ -312,6 +319,128 @@ void VariableStepRattleIntegrator::setConstraintTolerance(double tol) {
     settingsChanged();
 }
 
+// ------------------------------------------------------------------------------------------ constraints by expressions
+
+VariableStepRattleIntegrator::ExpressionConstraint
+VariableStepRattleIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
+                                              const std::map<string, double>& parameters) {
+    const string constraint = "VariableStepRattleIntegrator: the constraint \"" + expression + "\" ";
+    vector<string> names;
+    for (const auto& parameter : parameters) {
+        names.push_back(parameter.first);
+        if (!std::isfinite(parameter.second))
+            throw OpenMMException(constraint + "has the parameter " + parameter.first +
+                                  ", whose value is not a finite number");
+    }
+    vector<int> sorted = particles;
+    std::sort(sorted.begin(), sorted.end());
+    if (!sorted.empty() && sorted[0] < 0)
+        throw OpenMMException(constraint + "is of particle " + std::to_string(sorted[0]) +
+                              ", and the index of a particle cannot be negative");
+    const auto twice = std::adjacent_find(sorted.begin(), sorted.end());
+    if (twice != sorted.end())
+        throw OpenMMException(constraint + "names particle " + std::to_string(*twice) +
+                              " twice; name each particle once");
+    const auto key = std::make_tuple(expression, particles.size(), names);
+    if (checkedExpressions.count(key) == 0) {
+        requireValidExpression(expression, (int) particles.size(), parameters);
+        checkedExpressions.insert(key);
+    }
+    return {expression, particles, parameters};
+}
+
+int VariableStepRattleIntegrator::addConstraint(const string& expression, const vector<int>& particles,
+                                                const std::map<string, double>& parameters) {
+    expressionConstraints.push_back(checkConstraint(expression, particles, parameters));
+    settingsChanged();
+    return (int) expressionConstraints.size() - 1;
+}
+
+int VariableStepRattleIntegrator::getNumExpressionConstraints() const {
+    return (int) expressionConstraints.size();
+}
+
+void VariableStepRattleIntegrator::checkExpressionConstraintIndex(int index) const {
+    if (index < 0 || index >= getNumExpressionConstraints())
+        throw OpenMMException("VariableStepRattleIntegrator: there is no expression constraint with index " +
+                              std::to_string(index) + "; the integrator has " +
+                              std::to_string(getNumExpressionConstraints()));
+}
+
+void VariableStepRattleIntegrator::getExpressionConstraintParameters(int index, string& expression,
+                                                                     vector<int>& particles,
+                                                                     std::map<string, double>& parameters) const {
+    checkExpressionConstraintIndex(index);
+    expression = expressionConstraints[index].expression;
+    particles = expressionConstraints[index].particles;
+    parameters = expressionConstraints[index].parameters;
+}
+
+void VariableStepRattleIntegrator::setExpressionConstraintParameters(int index, const string& expression,
+                                                                     const vector<int>& particles,
+                                                                     const std::map<string, double>& parameters) {
+    checkExpressionConstraintIndex(index);
+    expressionConstraints[index] = checkConstraint(expression, particles, parameters);
+    settingsChanged();
+}
+
+void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, const string& name, double value) {
+    checkExpressionConstraintIndex(index);
+    ExpressionConstraint changed = expressionConstraints[index];
+    if (changed.parameters.count(name) == 0)
+        throw OpenMMException("VariableStepRattleIntegrator: the constraint \"" + changed.expression +
+                              "\" has no parameter " + name);
+    changed.parameters[name] = value;
+    setExpressionConstraintParameters(index, changed.expression, changed.particles, changed.parameters);
+}
+
+double VariableStepRattleIntegrator::getExpressionConstraintMultiplier(int index) const {
+    requireContext();
+    checkExpressionConstraintIndex(index);
+    const int numDistances = context->getSystem().getNumConstraints();
+    return getMultipliers().at(numDistances + index);
+}
+
+// What can be known of the constraints without positions.
+void VariableStepRattleIntegrator::checkExpressionConstraints(const ContextImpl& contextRef) const {
+    if (expressionConstraints.empty())
+        return;
+    const Platform& platform = const_cast<ContextImpl&>(contextRef).getPlatform();
+    if (dynamic_cast<const OpenMM::ReferencePlatform*>(&platform) == NULL)
+        throw OpenMMException("VariableStepRattleIntegrator: constraints given as expressions work on the platforms "
+                              "Reference and CPU, and this Context is on " +
+                              platform.getName() + "; create it on one of those");
+    const OpenMM::System& system = contextRef.getSystem();
+    for (int i = 0; i < getNumExpressionConstraints(); i++) {
+        const string constraint = "VariableStepRattleIntegrator: expression constraint " + std::to_string(i) + " (" +
+                                  expressionConstraints[i].expression + ") ";
+        bool canMove = false;
+        for (int particle : expressionConstraints[i].particles) {
+            if (particle >= system.getNumParticles())
+                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
+                                      ", and the System has " + std::to_string(system.getNumParticles()));
+            if (system.isVirtualSite(particle))
+                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
+                                      ", which is a virtual site; write it with the particles that define the site");
+            canMove |= system.getParticleMass(particle) > 0;
+        }
+        if (!canMove)
+            throw OpenMMException(constraint + "has no particle with mass, and so nothing that it could move");
+    }
+}
+
+// The values of the parameters of another integrator's constraints, where these are the same constraints.
+void VariableStepRattleIntegrator::copyExpressionParameters(const VariableStepRattleIntegrator& other) {
+    const auto areAlike = [](const ExpressionConstraint& a, const ExpressionConstraint& b) {
+        return a.expression == b.expression && a.particles == b.particles && haveSameNames(a.parameters, b.parameters);
+    };
+    if (std::equal(expressionConstraints.begin(), expressionConstraints.end(), other.expressionConstraints.begin(),
+                   other.expressionConstraints.end(), areAlike))
+        expressionConstraints = other.expressionConstraints;
+}
+
+// ----------------------------------------------------------------------------------------------------------- the run
+
 void VariableStepRattleIntegrator::step(int steps) {
     requireContext();
     for (int i = 0; i < steps; i++)
@@ -342,6 +471,7 @@ void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
     if (owner != NULL && &contextRef.getOwner() != owner)
         throw OpenMMException("This Integrator is already bound to a context");
     refuseDrudeParticles(contextRef);
+    checkExpressionConstraints(contextRef);
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
     created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef.getSystem(), *this);
     context = &contextRef;
@@ -409,12 +539,15 @@ void VariableStepRattleIntegrator::copySettings(const VariableStepRattleIntegrat
 void VariableStepRattleIntegrator::resumeRun(const VariableStepRattleIntegrator& saved, const VRattleRunState& run) {
     VariableStepRattleIntegrator previous(nominalStepSize);
     previous.copySettings(*this);
+    const vector<ExpressionConstraint> previousConstraints = expressionConstraints;
     try {
+        copyExpressionParameters(saved);
         copySettings(saved);
         kernel.getAs<IntegrateVRattleStepKernel>().resumeRun(*context, *this, run);
         lastStepSize = run.lastStepSize;
     }
     catch (...) {
+        expressionConstraints = previousConstraints;
         copySettings(previous);
         throw;
     }

@@ -5,8 +5,10 @@
 #include "openmm/OpenMMException.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include <map>
 #include <memory>
 #include <string>
+#include <vector>
 
 using namespace OpenMMVRattle;
 using OpenMM::OpenMMException;
@@ -15,10 +17,41 @@ using OpenMM::SerializationProxy;
 
 namespace {
 
-const int VERSION = 2; // 2: automatic step control
+const int VERSION = 2; // 2: automatic step control, constraints by expressions
 const char MINIMUM_STEP[] = "minimumStepSize", MAXIMUM_STEP[] = "maximumStepSize";
-const char AUTOMATIC_CONTROL[] = "AutomaticStepControl";
+const char AUTOMATIC_CONTROL[] = "AutomaticStepControl", EXPRESSION_CONSTRAINTS[] = "ExpressionConstraints";
 const char* const AUTOMATIC_REFERENCES[] = {"onStepReference", "halfStepReference"};
+
+void writeExpressionConstraints(const VariableStepRattleIntegrator& integrator, SerializationNode& node) {
+    for (int i = 0; i < integrator.getNumExpressionConstraints(); i++) {
+        std::string expression;
+        std::vector<int> particles;
+        std::map<std::string, double> parameters;
+        integrator.getExpressionConstraintParameters(i, expression, particles, parameters);
+        SerializationNode& constraint = node.createChildNode("Constraint");
+        constraint.setStringProperty("expression", expression);
+        for (int particle : particles)
+            constraint.createChildNode("Particle").setIntProperty("index", particle);
+        for (const auto& parameter : parameters)
+            constraint.createChildNode("Parameter")
+                .setStringProperty("name", parameter.first)
+                .setDoubleProperty("value", parameter.second);
+    }
+}
+
+void readExpressionConstraints(const SerializationNode& node, VariableStepRattleIntegrator& integrator) {
+    for (const SerializationNode& constraint : node.getChildren()) {
+        std::vector<int> particles;
+        std::map<std::string, double> parameters;
+        for (const SerializationNode& child : constraint.getChildren()) {
+            if (child.getName() == "Particle")
+                particles.push_back(child.getIntProperty("index"));
+            else
+                parameters[child.getStringProperty("name")] = child.getDoubleProperty("value");
+        }
+        integrator.addConstraint(constraint.getStringProperty("expression"), particles, parameters);
+    }
+}
 
 } // namespace
 
@@ -54,6 +87,8 @@ void VariableStepRattleIntegratorProxy::serialize(const void* object, Serializat
         for (int k = 0; k < 2; k++)
             automatic.setDoubleProperty(AUTOMATIC_REFERENCES[k], integrator.getSetReferenceMonitorValue(k));
     }
+    if (integrator.getNumExpressionConstraints() > 0)
+        writeExpressionConstraints(integrator, node.createChildNode(EXPRESSION_CONSTRAINTS));
 }
 
 void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& node) const {
@@ -80,12 +115,15 @@ void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& no
             integrator->addMonitor(kind, monitor.getDoubleProperty("weight"), monitor.getDoubleProperty("power"));
         integrator->setReferenceMonitorValue(monitor.getDoubleProperty("reference"), index);
     }
-    for (const SerializationNode& child : node.getChildren())
+    for (const SerializationNode& child : node.getChildren()) {
         if (child.getName() == AUTOMATIC_CONTROL) {
             integrator->useAutomaticStepControl(child.getIntProperty("calibrationSteps"));
             for (int k = 0; k < 2; k++)
                 integrator->setReferenceMonitorValue(child.getDoubleProperty(AUTOMATIC_REFERENCES[k]), k);
         }
+        else if (child.getName() == EXPRESSION_CONSTRAINTS)
+            readExpressionConstraints(child, *integrator);
+    }
     return integrator.release();
 }
 

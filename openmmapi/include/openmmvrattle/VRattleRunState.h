@@ -15,6 +15,8 @@
 
 namespace OpenMMVRattle {
 
+class VariableStepRattleIntegrator;
+
 /**
  * What a run needs to go on as if nothing had happened, beside the settings of the integrator and the positions,
  * velocities and parameters of the Context. Checkpoints and States hold it.
@@ -23,8 +25,9 @@ namespace OpenMMVRattle {
  * forces are others, and then the run must start afresh.
  */
 struct OPENMMVRATTLE_EXPORT VRattleRunState {
-    /** Fingerprint of the masses and the constraints. */
-    static unsigned long long fingerprintOf(const OpenMM::System& system);
+    /** Fingerprint of the masses and the constraints, but for the values of the parameters of expressions. */
+    static unsigned long long fingerprintOf(const OpenMM::System& system,
+                                            const VariableStepRattleIntegrator& integrator);
 
     /** Write or read everything, in binary form with a stream and as text with a SerializationNode. */
     void write(std::ostream& stream) const;

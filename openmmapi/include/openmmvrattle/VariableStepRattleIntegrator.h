@@ -8,7 +8,10 @@
 #include "openmm/Kernel.h"
 #include "openmmvrattle/windowsExportVRattle.h"
 #include <iosfwd>
+#include <map>
+#include <set>
 #include <string>
+#include <tuple>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -248,13 +251,23 @@ public:
     double getMonitorValue(int index = 0) const;
     /**
      * Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in the order of
-     * the System's constraints. The force of constraint k, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle
-     * i and the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d.
+     * the System's constraints, and behind them those of addConstraint(). The force of constraint k of the System, g = |r|^2 -
+     * d^2 with r = q_i - q_j, is -2 Lambda_k r on particle i and the opposite on j: a positive multiplier is a bond under
+     * tension, whose tension is 2 Lambda_k d. The force of any constraint g = 0 on a particle is -Lambda_k dg/dq.
      * Before the first step this computes the forces.
      *
-     * @return the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles
+     * @return the multipliers in kJ/mol/nm^2, 0 for a constraint between two massless particles; and of addConstraint() in
+     *         kJ/mol over the unit of the expression
      */
     std::vector<double> getMultipliers() const;
+    /**
+     * Get the Lagrange multiplier of one constraint of addConstraint(); see getMultipliers(). Where the expression is a reaction
+     * coordinate minus its value, it is the force that holds the coordinate there, with the sign of a force against g.
+     *
+     * @param index    the index of the constraint, as addConstraint() has returned it
+     * @return the multiplier in kJ/mol over the unit of the expression
+     */
+    double getExpressionConstraintMultiplier(int index) const;
     /**
      * Get how often the forces have been computed for this integrator since the Context was created or reinitialized.
      * This and the following counts go on when a checkpoint or a State is loaded.
@@ -270,11 +283,74 @@ public:
      */
     long long getNumRescues() const;
     /**
-     * Set the relative tolerance of constrained distances. Default: 1e-8.
+     * Set the relative tolerance of the constraints. Default: 1e-8.
      *
-     * @param tol    the tolerance, as a fraction of the constrained distance; positive and finite
+     * For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of 0.1 nm, about
+     * the length of a bond, and the error that is compared with it is the distance of the particles from where g = 0 holds, to
+     * first order: |g| over the Euclidean norm of the gradient of g with respect to the particles that have mass. It is
+     * therefore the same for g and for 1000 g.
+     *
+     * @param tol    the tolerance; positive and finite
      */
     void setConstraintTolerance(double tol) override;
+    /**
+     * Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm, which are
+     * called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters of this constraint, which
+     * have names. It has the syntax of OpenMM's custom forces: operators + - * / ^, their functions, and intermediate
+     * values defined after a semicolon, as in "r - r0; r = sqrt((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2)". Derivatives are found
+     * symbolically. Constraints that have the same expression, with different particles and values of parameters, are evaluated
+     * together, which is much faster.
+     *
+     * The gradient of g must not vanish where g = 0: a point is kept on a sphere by r - r0 or by r^2 - r0^2, but not by
+     * (r - r0)^2. Coordinates are taken as they are, not as their nearest periodic images. A particle of mass zero is a
+     * fixed point; at least one of the particles must have mass, and none may be a virtual site.
+     *
+     * As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at the first
+     * step. OpenMM itself knows nothing of it: Context::applyConstraints() and applyVelocityConstraints() leave it alone, and a
+     * CompoundIntegrator's other integrators do not keep it. It works on the platforms Reference and CPU.
+     *
+     * A constraint that is added after the Context was created takes effect with Context::reinitialize(); until then steps throw an
+     * exception.
+     *
+     * @param expression    the expression g
+     * @param particles     the indices of the particles
+     * @param parameters    the values of the parameters
+     * @return the index of the constraint among those that were added
+     */
+    int addConstraint(const std::string& expression, const std::vector<int>& particles,
+                      const std::map<std::string, double>& parameters = {});
+    /** Get the number of constraints that addConstraint() has added. */
+    int getNumExpressionConstraints() const;
+    /**
+     * Get what a constraint was added with.
+     *
+     * @param index              the index of the constraint
+     * @param[out] expression    the expression
+     * @param[out] particles     the indices of the particles
+     * @param[out] parameters    the values of the parameters
+     */
+    void getExpressionConstraintParameters(int index, std::string& expression, std::vector<int>& particles,
+                                           std::map<std::string, double>& parameters) const;
+    /**
+     * Change a constraint. New values of its parameters are in force at the next step, which starts the run afresh from positions
+     * that satisfy the constraint; another expression, other particles or other names take effect with
+     * Context::reinitialize(), as for addConstraint().
+     *
+     * @param index         the index of the constraint
+     * @param expression    the expression
+     * @param particles     the indices of the particles
+     * @param parameters    the values of the parameters
+     */
+    void setExpressionConstraintParameters(int index, const std::string& expression, const std::vector<int>& particles,
+                                           const std::map<std::string, double>& parameters);
+    /**
+     * Change the value of one parameter of a constraint; see setExpressionConstraintParameters().
+     *
+     * @param index    the index of the constraint
+     * @param name     the name of the parameter
+     * @param value    its new value
+     */
+    void setExpressionConstraintParameter(int index, const std::string& name, double value);
     /**
      * Advance the simulation by a number of steps.
      *
@@ -313,7 +389,17 @@ private:
         MonitorKind kind;
         double weight, power, reference;
     };
+    struct ExpressionConstraint {
+        std::string expression;
+        std::vector<int> particles;
+        std::map<std::string, double> parameters;
+    };
     void settingsChanged();
+    ExpressionConstraint checkConstraint(const std::string& expression, const std::vector<int>& particles,
+                                         const std::map<std::string, double>& parameters);
+    void checkExpressionConstraintIndex(int index) const;
+    void checkExpressionConstraints(const OpenMM::ContextImpl& context) const;
+    void copyExpressionParameters(const VariableStepRattleIntegrator& other);
     void requireContext() const;
     void checkMonitorIndex(int index) const;
     void checkReferenceIndex(int index) const;
@@ -333,6 +419,9 @@ private:
     bool automatic;
     int calibrationSteps, numAutomaticRequests;
     double automaticReferences[2];
+    std::vector<ExpressionConstraint> expressionConstraints;
+    // What has been found to be right: expression, number of particles and names of the parameters.
+    std::set<std::tuple<std::string, size_t, std::vector<std::string>>> checkedExpressions;
     OpenMM::Kernel kernel;
     // Context::reinitialize() writes a checkpoint, cleans up, and loads it: how far this has gone.
     enum ReinitializationPhase { None, CheckpointWritten, CleanedUp };

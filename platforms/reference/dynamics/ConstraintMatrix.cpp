@@ -13,8 +13,8 @@ ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system) : system(syst
     const vector<ConstraintSystem::Coupling>& couplings = system.getCouplings();
     vector<std::pair<int, int>> entries;
     for (const auto& coupling : couplings)
-        if (coupling.row != coupling.column)
-            entries.emplace_back(coupling.row, coupling.column);
+        if (system.getConstraintOf(coupling.row) != system.getConstraintOf(coupling.column))
+            entries.emplace_back(system.getConstraintOf(coupling.row), system.getConstraintOf(coupling.column));
     const vector<vector<int>> pattern = findFactorPattern(size, entries);
     columnStart.assign(1, 0);
     size_t longest = 0;
@@ -39,8 +39,9 @@ ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system) : system(syst
     }
     firstGeneralCoupling = couplings.size();
     for (size_t i = 0; i < couplings.size(); i++) {
-        couplingSlots.push_back(slotOf(couplings[i].row, couplings[i].column));
-        if (couplings[i].row >= system.getFirstGeneral())
+        const int row = system.getConstraintOf(couplings[i].row), column = system.getConstraintOf(couplings[i].column);
+        couplingSlots.push_back(slotOf(row, column));
+        if (row >= system.getFirstGeneral())
             firstGeneralCoupling = std::min(firstGeneralCoupling, i);
     }
     values.resize(numEntries + size);
@@ -54,7 +55,7 @@ void ConstraintMatrix::factorize(const ConstraintSystem::Jacobian& jacobian, int
     const int size = system.getNumConstraints();
     std::fill(values.begin() + columnStart[first], values.begin() + numEntries, 0.0);
     std::fill(values.begin() + numEntries + first, values.end(), 0.0);
-    // Two constraints that share both particles have two couplings with one slot, which must add up.
+    // Two constraints that share several particles have several couplings with one slot, which must add up.
     for (size_t i = first == 0 ? 0 : firstGeneralCoupling; i < couplings.size(); i++)
         values[couplingSlots[i]] += couplings[i].factor * jacobian[couplings[i].row].dot(jacobian[couplings[i].column]);
     double* diagonal = values.data() + numEntries;
@@ -65,8 +66,14 @@ void ConstraintMatrix::factorize(const ConstraintSystem::Jacobian& jacobian, int
         if (!(pivot > MIN_RELATIVE_PIVOT * inversePivots[column])) {
             for (size_t c = 0; c < system.getClusters().size(); c++) {
                 const ConstraintSystem::Cluster& cluster = system.getClusters()[c];
-                if (column >= cluster.first && column < cluster.first + cluster.size)
-                    throw DependentConstraints(system.getClusterParticles((int) c));
+                if (column < cluster.first || column >= cluster.first + cluster.size)
+                    continue;
+                for (int k = cluster.first; k < cluster.first + cluster.size; k++) {
+                    const std::string explanation = system.explainGradient(k, jacobian);
+                    if (!explanation.empty())
+                        throw StepFailure(explanation);
+                }
+                throw DependentConstraints(system.getClusterParticles((int) c));
             }
         }
         const double inverse = 1 / pivot;

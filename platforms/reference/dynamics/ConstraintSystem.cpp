@@ -20,10 +20,21 @@ namespace {
 // The number of particles of a block, whose positions, velocities and forces take 150 kB.
 const int BLOCK_SIZE = 1024;
 
+std::string listParticles(const vector<int>& particles) {
+    const size_t maxListed = 12;
+    std::string text = particles.size() == 1 ? "particle " : "the particles ";
+    for (size_t i = 0; i < particles.size() && i < maxListed; i++)
+        text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
+    return particles.size() > maxListed ? text + ", ... (" + std::to_string(particles.size()) + " in all)" : text;
+}
+
 } // namespace
 
-ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<DistanceConstraint>& given) :
-        numGivenConstraints((int) given.size()), masses(masses), inverseMasses(masses.size()) {
+ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<DistanceConstraint>& distances,
+                                   const vector<ExpressionConstraint>& expressions) :
+        numGivenConstraints((int) (distances.size() + expressions.size())), numGivenDistances((int) distances.size()),
+        masses(masses), inverseMasses(masses.size()), expressions(expressions) {
+    const Given given = {distances, expressions};
     for (size_t i = 0; i < masses.size(); i++)
         inverseMasses[i] = masses[i] > 0 ? 1.0 / masses[i] : 0.0;
 
@@ -44,12 +55,13 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
     vector<char> isInBatch(masses.size(), false);
     for (vector<int>& cluster : findClusters(given)) {
         vector<DistanceConstraint> members;
-        bool canMove = true;
+        bool mayBeInBatch = true;
         for (int k : cluster) {
-            members.push_back(given[k]);
-            canMove = canMove && inverseMasses[given[k].particle1] > 0 && inverseMasses[given[k].particle2] > 0;
+            mayBeInBatch = mayBeInBatch && !given.isExpression(k) && findMovingParticles(given, k).size() == 2;
+            if (mayBeInBatch)
+                members.push_back(distances[k]);
         }
-        if (!canMove || !ClusterBatch::isSupported(members)) {
+        if (!mayBeInBatch || !ClusterBatch::isSupported(members)) {
             orderForElimination(given, cluster);
             general.push_back(cluster);
             continue;
@@ -85,23 +97,44 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
     firstGeneral = (int) constraints.size();
     for (const vector<int>& cluster : general)
         appendCluster(given, cluster);
+    groupExpressions(given);
+    findStretches();
     findCouplings();
     classifyParticles(isInBatch);
     findBlocks();
-    isFreeToTranslate = std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
-        return inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0;
-    });
-    for (const DistanceConstraint& c : constraints) {
-        inverseSquareLengths.push_back(1.0 / (c.length * c.length));
-        distanceMultiplierFactors.push_back(0.5 / (c.length * c.length));
+    isFreeToTranslate =
+        expressions.empty() && std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
+            return inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0;
+        });
+    for (int k = 0; k < getNumConstraints(); k++) {
+        const double length = constraints[k].length;
+        inverseSquareLengths.push_back(1.0 / (length * length));
+        multiplierFactors.push_back(isExpression(k) ? 1.0 : 0.5 / (length * length));
     }
 }
 
 ConstraintSystem::~ConstraintSystem() {
 }
 
+vector<int> ConstraintSystem::findMovingParticles(const Given& given, int k) const {
+    vector<int> result;
+    auto addIfMoving = [&](int i) {
+        if (inverseMasses[i] > 0)
+            result.push_back(i);
+    };
+    if (given.isExpression(k)) {
+        for (int i : given.getExpression(k).particles)
+            addIfMoving(i);
+    }
+    else {
+        addIfMoving(given.distances[k].particle1);
+        addIfMoving(given.distances[k].particle2);
+    }
+    return result;
+}
+
 // Constraints that share a moving particle belong to one cluster (union-find over the particles).
-vector<vector<int>> ConstraintSystem::findClusters(const vector<DistanceConstraint>& given) const {
+vector<vector<int>> ConstraintSystem::findClusters(const Given& given) const {
     vector<int> parent(masses.size());
     std::iota(parent.begin(), parent.end(), 0);
     auto find = [&](int i) {
@@ -111,16 +144,18 @@ vector<vector<int>> ConstraintSystem::findClusters(const vector<DistanceConstrai
         }
         return i;
     };
-    for (const DistanceConstraint& c : given)
-        if (inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0)
-            parent[find(c.particle1)] = find(c.particle2);
+    for (int k = 0; k < given.getSize(); k++) {
+        const vector<int> moving = findMovingParticles(given, k);
+        for (size_t i = 1; i < moving.size(); i++)
+            parent[find(moving[0])] = find(moving[i]);
+    }
     vector<int> clusterOfRoot(masses.size(), -1);
     vector<vector<int>> result;
-    for (int k = 0; k < (int) given.size(); k++) {
-        const int moving = inverseMasses[given[k].particle1] > 0 ? given[k].particle1 : given[k].particle2;
-        if (inverseMasses[moving] == 0)
+    for (int k = 0; k < given.getSize(); k++) {
+        const vector<int> moving = findMovingParticles(given, k);
+        if (moving.empty())
             continue;
-        int& cluster = clusterOfRoot[find(moving)];
+        int& cluster = clusterOfRoot[find(moving[0])];
         if (cluster < 0) {
             cluster = (int) result.size();
             result.emplace_back();
@@ -131,23 +166,51 @@ vector<vector<int>> ConstraintSystem::findClusters(const vector<DistanceConstrai
 }
 
 /*
- * Order the constraints of a cluster so that eliminating them one after the other fills in little: from the far ends of
- * the molecule towards its middle, in the order in which a depth-first walk from there leaves them. On a tree (most
- * molecules, but for rings) there is no fill at all, and neighbours in memory are neighbours in the molecule.
+ * Order the constraints of a cluster so that eliminating them one after the other fills in little, and neighbours in memory
+ * are neighbours in the molecule. Two constraints are coupled if they share a moving particle.
  */
-void ConstraintSystem::orderForElimination(const vector<DistanceConstraint>& given, vector<int>& cluster) const {
+void ConstraintSystem::orderForElimination(const Given& given, vector<int>& cluster) const {
     std::map<int, vector<int>> constraintsOf;
-    for (int k : cluster)
-        for (int i : {given[k].particle1, given[k].particle2})
-            if (inverseMasses[i] > 0)
-                constraintsOf[i].push_back(k);
-    auto other = [&](int k, int i) { return given[k].particle1 == i ? given[k].particle2 : given[k].particle1; };
+    bool hasExpression = false;
+    for (int k : cluster) {
+        hasExpression |= given.isExpression(k);
+        for (int i : findMovingParticles(given, k))
+            constraintsOf[i].push_back(k);
+    }
+    const vector<int> order = hasExpression ? walkThroughConstraints(given, cluster, constraintsOf)
+                                            : walkThroughParticles(given, cluster, constraintsOf);
+    std::map<int, int> placeOf;
+    for (size_t place = 0; place < order.size(); place++)
+        placeOf[order[place]] = (int) place;
+    vector<std::pair<int, int>> entries;
+    for (const auto& list : constraintsOf)
+        for (int a : list.second)
+            for (int b : list.second)
+                if (placeOf[a] > placeOf[b])
+                    entries.emplace_back(placeOf[a], placeOf[b]);
+    std::sort(entries.begin(), entries.end());
+    entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
+    cluster.clear();
+    for (int place : findEliminationOrder((int) order.size(), entries))
+        cluster.push_back(order[place]);
+}
+
+/*
+ * The distance constraints of a cluster from the far ends of the molecule towards its middle, in the order in which a
+ * depth-first walk from there leaves them. On a tree (most molecules, but for rings) there is no fill at all.
+ */
+vector<int> ConstraintSystem::walkThroughParticles(const Given& given, const vector<int>&,
+                                                   const std::map<int, vector<int>>& constraintsOf) const {
+    auto other = [&](int k, int i) {
+        const DistanceConstraint& c = given.distances[k];
+        return c.particle1 == i ? c.particle2 : c.particle1;
+    };
     // The particles in the order of a breadth-first walk, and from where each was reached.
     auto walkBreadthFirst = [&](int start, std::map<int, int>& origin) {
         origin = {{start, start}};
         vector<int> queue = {start};
         for (size_t next = 0; next < queue.size(); next++)
-            for (int k : constraintsOf[queue[next]]) {
+            for (int k : constraintsOf.at(queue[next])) {
                 int i = other(k, queue[next]);
                 if (inverseMasses[i] > 0 && origin.emplace(i, queue[next]).second)
                     queue.push_back(i);
@@ -172,7 +235,7 @@ void ConstraintSystem::orderForElimination(const vector<DistanceConstraint>& giv
     vector<Place> path = {{root, -1, 0}};
     while (!path.empty()) {
         Place& place = path.back();
-        const vector<int>& list = constraintsOf[place.particle];
+        const vector<int>& list = constraintsOf.at(place.particle);
         if (place.next < list.size()) {
             const int k = list[place.next++], i = other(k, place.particle);
             if (inverseMasses[i] > 0 && seen.insert(i).second) {
@@ -189,35 +252,117 @@ void ConstraintSystem::orderForElimination(const vector<DistanceConstraint>& giv
             order.push_back(place.arrivedBy);
         path.pop_back();
     }
-    // Two constraints are coupled if they share a moving particle.
-    std::map<int, int> placeOf;
-    for (size_t place = 0; place < order.size(); place++)
-        placeOf[order[place]] = (int) place;
-    vector<std::pair<int, int>> entries;
-    for (const auto& list : constraintsOf)
-        for (int a : list.second)
-            for (int b : list.second)
-                if (placeOf[a] > placeOf[b])
-                    entries.emplace_back(placeOf[a], placeOf[b]);
-    std::sort(entries.begin(), entries.end());
-    entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
-    cluster.clear();
-    for (int place : findEliminationOrder((int) order.size(), entries))
-        cluster.push_back(order[place]);
+    return order;
 }
 
-void ConstraintSystem::appendCluster(const vector<DistanceConstraint>& given, const vector<int>& cluster) {
+/*
+ * The constraints of a cluster with expressions in the reverse order of a breadth-first walk (Cuthill and McKee, Proc. 24th
+ * ACM National Conf., 1969) from a constraint at one end. What is chained, such as the cross-sections of a rod, then has
+ * couplings to near neighbours alone.
+ */
+vector<int> ConstraintSystem::walkThroughConstraints(const Given& given, const vector<int>& cluster,
+                                                     const std::map<int, vector<int>>& constraintsOf) const {
+    auto walk = [&](int start) {
+        std::set<int> seenConstraints = {start}, seenParticles;
+        vector<int> queue = {start};
+        for (size_t next = 0; next < queue.size(); next++)
+            for (int i : findMovingParticles(given, queue[next]))
+                if (seenParticles.insert(i).second)
+                    for (int k : constraintsOf.at(i))
+                        if (seenConstraints.insert(k).second)
+                            queue.push_back(k);
+        return queue;
+    };
+    vector<int> order = walk(walk(cluster[0]).back());
+    std::reverse(order.begin(), order.end());
+    return order;
+}
+
+void ConstraintSystem::appendCluster(const Given& given, const vector<int>& cluster) {
     clusters.push_back({(int) constraints.size(), (int) cluster.size()});
     for (int k : cluster) {
-        constraints.push_back(given[k]);
+        constraints.push_back(given.isExpression(k) ? DistanceConstraint{-1, -1, 1.0} : given.distances[k]);
         givenIndex.push_back(k);
     }
+}
+
+// Give every expression its entries of a Jacobian and put it into the group of its like.
+void ConstraintSystem::groupExpressions(const Given& given) {
+    vector<int> constraintOf(given.getSize(), -1);
+    for (int k = 0; k < getNumConstraints(); k++)
+        constraintOf[givenIndex[k]] = k;
+    typedef std::tuple<std::string, size_t, vector<std::string>> Kind;
+    std::map<Kind, int> groupOf;
+    vector<int> groupSizes;
+    for (int e = 0; e < (int) expressions.size(); e++) {
+        const ExpressionConstraint& c = expressions[e];
+        const int k = constraintOf[numGivenDistances + e], firstEntry = getNumEntries();
+        for (int i : c.particles)
+            expressionEntries.push_back({k, i});
+        expressionRows.push_back({k, firstEntry, getNumEntries()});
+        vector<std::string> names;
+        for (const auto& parameter : c.parameters)
+            names.push_back(parameter.first);
+        const auto found = groupOf.emplace(Kind(c.expression, c.particles.size(), names), (int) groups.size());
+        const int group = found.first->second;
+        if (found.second) {
+            groups.emplace_back(new ExpressionGroup(c));
+            groupSizes.push_back(0);
+        }
+        groups[group]->add(c, k, firstEntry, inverseMasses);
+        placeInGroups.emplace_back(group, groupSizes[group]++);
+    }
+}
+
+void ConstraintSystem::setParameters(int expression, const std::map<std::string, double>& parameters) {
+    expressions[expression].parameters = parameters;
+    const std::pair<int, int>& place = placeInGroups[expression];
+    groups[place.first]->setParameters(place.second, parameters);
+}
+
+void ConstraintSystem::findStretches() {
+    for (int k = 0; k < getNumConstraints(); k++) {
+        if (isExpression(k))
+            continue;
+        if (distanceStretches.empty() || distanceStretches.back().end != k)
+            distanceStretches.push_back({k, k});
+        distanceStretches.back().end++;
+    }
+}
+
+std::string ConstraintSystem::describe(int index) const {
+    if (!isExpression(index))
+        return "the constrained distance between the particles " + std::to_string(constraints[index].particle1) +
+               " and " + std::to_string(constraints[index].particle2);
+    const int e = givenIndex[index] - numGivenDistances;
+    return "expression constraint " + std::to_string(e) + " (" + expressions[e].expression + " = 0) of " +
+           listParticles(expressions[e].particles);
+}
+
+std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobian) const {
+    if (!isExpression(index))
+        return "";
+    const ExpressionRow& row = expressionRows[givenIndex[index] - numGivenDistances];
+    double square = 0;
+    for (int entry = row.first; entry < row.end; entry++)
+        square += jacobian[entry].dot(jacobian[entry]);
+    if (square > 0 && std::isfinite(square))
+        return "";
+    return "the gradient of " + describe(index) +
+           (square == 0
+                ? " is zero, so that it can be held by no force; choose other positions, or write it such that its "
+                  "gradient does not vanish where it holds"
+                : " is not finite at these positions; choose others, or write it such that it has a derivative "
+                  "where it holds");
 }
 
 void ConstraintSystem::classifyParticles(const vector<char>& isInBatch) {
     vector<char> isGeneral(masses.size(), false);
     for (int k = firstGeneral; k < getNumConstraints(); k++)
-        isGeneral[constraints[k].particle1] = isGeneral[constraints[k].particle2] = true;
+        if (!isExpression(k))
+            isGeneral[constraints[k].particle1] = isGeneral[constraints[k].particle2] = true;
+    for (const ExpressionEntry& entry : expressionEntries)
+        isGeneral[entry.particle] = true;
     for (int i = 0; i < getNumParticles(); i++)
         if (inverseMasses[i] > 0 && !isInBatch[i])
             (isGeneral[i] ? generalParticles : freeParticles).push_back(i);
@@ -236,45 +381,80 @@ void ConstraintSystem::findBlocks() {
 
 void ConstraintSystem::findCouplings() {
     struct End {
-        int constraint, sign;
+        int entry, sign;
     };
     vector<vector<End>> ends(masses.size());
+    auto addEnd = [&](int particle, int entry, int sign) {
+        if (inverseMasses[particle] > 0)
+            ends[particle].push_back({entry, sign});
+    };
     for (int k = 0; k < getNumConstraints(); k++) {
+        if (isExpression(k))
+            continue;
         int i = constraints[k].particle1, j = constraints[k].particle2;
         couplings.push_back({k, k, inverseMasses[i] + inverseMasses[j]});
-        if (inverseMasses[i] > 0)
-            ends[i].push_back({k, 1});
-        if (inverseMasses[j] > 0)
-            ends[j].push_back({k, -1});
+        addEnd(i, k, 1);
+        addEnd(j, k, -1);
+    }
+    for (size_t e = 0; e < expressionEntries.size(); e++) {
+        const int entry = getNumConstraints() + (int) e, particle = expressionEntries[e].particle;
+        if (inverseMasses[particle] > 0)
+            couplings.push_back({entry, entry, inverseMasses[particle]});
+        addEnd(particle, entry, 1);
     }
     for (size_t p = 0; p < ends.size(); p++)
         for (size_t a = 0; a < ends[p].size(); a++)
             for (size_t b = 0; b < a; b++) {
-                int row = std::max(ends[p][a].constraint, ends[p][b].constraint);
-                int column = std::min(ends[p][a].constraint, ends[p][b].constraint);
+                int row = ends[p][a].entry, column = ends[p][b].entry;
+                if (getConstraintOf(row) < getConstraintOf(column))
+                    std::swap(row, column);
                 couplings.push_back({row, column, ends[p][a].sign * ends[p][b].sign * inverseMasses[p]});
             }
-    std::stable_sort(couplings.begin(), couplings.end(), [](const Coupling& a, const Coupling& b) {
-        return a.row != b.row ? a.row < b.row : a.column < b.column;
+    std::stable_sort(couplings.begin(), couplings.end(), [&](const Coupling& a, const Coupling& b) {
+        const int rowA = getConstraintOf(a.row), rowB = getConstraintOf(b.row);
+        return rowA != rowB ? rowA < rowB : getConstraintOf(a.column) < getConstraintOf(b.column);
     });
 }
 
 vector<int> ConstraintSystem::getClusterParticles(int cluster) const {
     std::set<int> particles;
     for (int k = clusters[cluster].first; k < clusters[cluster].first + clusters[cluster].size; k++) {
-        particles.insert(constraints[k].particle1);
-        particles.insert(constraints[k].particle2);
+        if (isExpression(k)) {
+            const vector<int>& members = expressions[givenIndex[k] - numGivenDistances].particles;
+            particles.insert(members.begin(), members.end());
+        }
+        else {
+            particles.insert(constraints[k].particle1);
+            particles.insert(constraints[k].particle2);
+        }
     }
     return vector<int>(particles.begin(), particles.end());
 }
 
-double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, int first) const {
+// How far the particles are from where an expression holds, to first order, in units of EXPRESSION_LENGTH.
+double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<double>& g, const Jacobian& nearby) const {
+    double square = 0;
+    for (int entry = row.first; entry < row.end; entry++)
+        square += nearby[entry].dot(nearby[entry]);
+    return std::fabs(g[row.constraint]) / (std::sqrt(square) * EXPRESSION_LENGTH);
+}
+
+double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby, int first) const {
     double largest = 0;
-    for (int k = first; k < getNumConstraints(); k++) {
-        Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
-        double length = constraints[k].length;
-        g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
-        double size = std::fabs(g[k]);
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
+            Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
+            double length = constraints[k].length;
+            g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
+            double size = std::fabs(g[k]);
+            if (std::isnan(size))
+                return size;
+            largest = std::max(largest, size);
+        }
+    for (const auto& group : groups)
+        group->evaluate(q, g);
+    for (const ExpressionRow& row : expressionRows) {
+        const double size = findErrorOf(row, g, nearby);
         if (std::isnan(size))
             return size;
         largest = std::max(largest, size);
@@ -282,60 +462,107 @@ double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, int 
     return largest;
 }
 
-int ConstraintSystem::findLargest(const vector<double>& g) const {
+int ConstraintSystem::findLargest(const vector<double>& g, const Jacobian& nearby) const {
+    vector<double> errors = g;
+    for (const ExpressionRow& row : expressionRows)
+        errors[row.constraint] = findErrorOf(row, g, nearby);
     int largest = 0;
     for (int k = 1; k < getNumConstraints(); k++)
-        if (!(std::fabs(g[k]) <= std::fabs(g[largest])))
+        if (!(std::fabs(errors[k]) <= std::fabs(errors[largest])))
             largest = k;
     return largest;
 }
 
-void ConstraintSystem::evaluateJacobian(const vector<Vec3>& x, Jacobian& jacobian, int first) const {
-    for (int k = first; k < getNumConstraints(); k++)
-        jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
+// The distance constraints' part of G(x).
+void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jacobian, int first) const {
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++)
+            jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
+}
+
+void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, int first) const {
+    evaluateDistanceRows(q, jacobian, first);
+    for (const auto& group : groups)
+        group->evaluateJacobian(q, jacobian);
+}
+
+void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, Jacobian& jacobian,
+                                                int first) const {
+    evaluateDistanceRows(v, jacobian, first);
+    for (const auto& group : groups)
+        group->evaluateVelocityJacobian(q, v, jacobian);
 }
 
 void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result,
                                 int first) const {
-    for (int k = first; k < getNumConstraints(); k++)
-        result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]);
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++)
+            result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]);
+    for (const ExpressionRow& row : expressionRows) {
+        double sum = 0;
+        for (int entry = row.first; entry < row.end; entry++)
+            sum += jacobian[entry].dot(w[getParticleOf(entry)]);
+        result[row.constraint] = sum;
+    }
 }
 
 void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result,
                                         int first) const {
-    for (int k = first; k < getNumConstraints(); k++) {
-        int i = constraints[k].particle1, j = constraints[k].particle2;
-        result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
+            int i = constraints[k].particle1, j = constraints[k].particle2;
+            result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
+        }
+    for (const ExpressionRow& row : expressionRows) {
+        double sum = 0;
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = getParticleOf(entry);
+            sum += jacobian[entry].dot(f[i]) * inverseMasses[i];
+        }
+        result[row.constraint] = sum;
     }
 }
 
 void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result) const {
-    for (int k = 0; k < getNumConstraints(); k++) {
-        Vec3 force = jacobian[k] * x[k];
-        result[constraints[k].particle1] += force;
-        result[constraints[k].particle2] -= force;
-    }
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = stretch.first; k < stretch.end; k++) {
+            Vec3 force = jacobian[k] * x[k];
+            result[constraints[k].particle1] += force;
+            result[constraints[k].particle2] -= force;
+        }
+    for (size_t e = 0; e < expressionEntries.size(); e++)
+        result[expressionEntries[e].particle] += jacobian[getNumConstraints() + e] * x[expressionEntries[e].constraint];
 }
 
 void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vector<double>& x, double scale,
                                              vector<Vec3>& result, int first) const {
-    for (int k = first; k < getNumConstraints(); k++) {
-        int i = constraints[k].particle1, j = constraints[k].particle2;
-        Vec3 force = jacobian[k] * (scale * x[k]);
-        result[i] += force * inverseMasses[i];
-        result[j] -= force * inverseMasses[j];
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
+            int i = constraints[k].particle1, j = constraints[k].particle2;
+            Vec3 force = jacobian[k] * (scale * x[k]);
+            result[i] += force * inverseMasses[i];
+            result[j] -= force * inverseMasses[j];
+        }
+    for (size_t e = 0; e < expressionEntries.size(); e++) {
+        const int i = expressionEntries[e].particle;
+        result[i] +=
+            jacobian[getNumConstraints() + e] * (scale * x[expressionEntries[e].constraint] * inverseMasses[i]);
     }
 }
 
-void ConstraintSystem::evaluateCurvature(const vector<Vec3>& v, vector<double>& result, int first) const {
-    for (int k = first; k < getNumConstraints(); k++) {
-        Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
-        result[k] = w.dot(w) * inverseSquareLengths[k];
-    }
+void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result,
+                                         int first) const {
+    for (const Stretch& stretch : distanceStretches)
+        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
+            Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
+            result[k] = w.dot(w) * inverseSquareLengths[k];
+        }
+    for (const auto& group : groups)
+        group->evaluateCurvature(q, v, result);
 }
 
-void ConstraintSystem::getDistanceMultipliers(const vector<double>& multipliers, vector<double>& result) const {
+void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, vector<double>& result) const {
     result.assign(numGivenConstraints, 0.0);
     for (int k = 0; k < getNumConstraints(); k++)
-        result[givenIndex[k]] = multipliers[k] * distanceMultiplierFactors[k];
+        result[givenIndex[k]] = multipliers[k] * multiplierFactors[k];
 }

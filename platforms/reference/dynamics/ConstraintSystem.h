@@ -4,8 +4,11 @@
 #ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
+#include "ExpressionGroup.h"
 #include "openmm/Vec3.h"
 #include <memory>
+#include <string>
+#include <utility>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -23,16 +26,23 @@ struct DistanceConstraint {
  *
  * Each distance constraint is written in relative form, g = (|r|^2 - L^2)/(2 L^2) with r = q1 - q2, so that g is the
  * relative error of the distance and one tolerance serves all. Its row of G is r/L^2 on particle 1 and the opposite on
- * particle 2. A multiplier of this form is 2 L^2 times the multiplier of |r|^2 - L^2; see toDistanceMultiplier().
+ * particle 2. A multiplier of this form is 2 L^2 times the multiplier of |r|^2 - L^2; see toGivenMultiplier().
+ *
+ * A constraint given as an expression is taken as it is written, g(x1, y1, z1, x2, ...) = 0. Its error is measured as a
+ * distance, |g| over the norm of its gradient with respect to the particles that move, relative to EXPRESSION_LENGTH: so
+ * it is the same for g and for 1000 g, and one tolerance serves these constraints too.
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
  * neighbours: first the small clusters that come in batches of one shape, then the general ones. The functions below take
- * a first constraint and work on those from there on: 0 for all, getFirstGeneral() for the general clusters. Constraints
- * between two particles of mass zero cannot move anything and are left out.
+ * a first constraint and work on those from there on: 0 for all, getFirstGeneral() for the general clusters. A cluster with
+ * an expression is general. Distance constraints between two particles of mass zero cannot move anything and are left out.
  */
 class ConstraintSystem {
 public:
-    /** The rows of G, one per constraint in internal order: the part that acts on particle 1, 1/nm. */
+    /**
+     * The rows of G, of length getNumEntries(). A distance constraint has one entry, its place in the internal order: the part
+     * of its row that acts on particle 1, 1/nm. The rows of expressions lie behind, an entry for each particle.
+     */
     typedef std::vector<OpenMM::Vec3> Jacobian;
     /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
     struct Cluster {
@@ -46,17 +56,32 @@ public:
         std::vector<int> clusters; // the first cluster of each batch; a multiple of PACK_SIZE
         int freeParticle;          // the first in getFreeParticles()
     };
-    /** Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column). */
+    /**
+     * Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column), row and column being
+     * entries of the Jacobian. The constraint of row (see getConstraintOf()) is never before that of column.
+     */
     struct Coupling {
-        int row, column; // row >= column
-        double factor;   // +-1/mass of the shared particle, or 1/m1 + 1/m2 on the diagonal
+        int row, column;
+        double factor; // +-1/mass of the shared particle, or 1/m1 + 1/m2 on the diagonal of a distance constraint
     };
+    /** The row of an expression has the entries first, ..., end - 1 of a Jacobian. */
+    struct ExpressionRow {
+        int constraint, first, end;
+    };
+    /** An entry of an expression's row. */
+    struct ExpressionEntry {
+        int constraint, particle;
+    };
+    /** Errors of expressions are relative to this distance (nm), which is about that of a bond. */
+    static constexpr double EXPRESSION_LENGTH = 0.1;
 
     /**
      * @param masses         the mass of each particle (amu); 0 for a particle that does not move
      * @param constraints    the distance constraints
+     * @param expressions    the constraints given as expressions, of at least one particle with mass each
      */
-    ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+    ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                     const std::vector<ExpressionConstraint>& expressions = {});
     ~ConstraintSystem();
 
     int getNumParticles() const {
@@ -65,7 +90,7 @@ public:
     int getNumConstraints() const {
         return (int) constraints.size();
     }
-    /** The number of constraints that were given to the constructor, with those that were left out. */
+    /** The number of constraints of both kinds that were given to the constructor, with those that were left out. */
     int getNumGivenConstraints() const {
         return numGivenConstraints;
     }
@@ -76,9 +101,33 @@ public:
     const std::vector<double>& getInverseMasses() const {
         return inverseMasses;
     }
+    /** The length of a Jacobian. */
+    int getNumEntries() const {
+        return getNumConstraints() + (int) expressionEntries.size();
+    }
+    /** Whether a constraint is given as an expression. */
+    bool isExpression(int index) const {
+        return !expressions.empty() && givenIndex[index] >= numGivenDistances;
+    }
+    /** A distance constraint. */
     const DistanceConstraint& getConstraint(int index) const {
         return constraints[index];
     }
+    const std::vector<ExpressionRow>& getExpressionRows() const {
+        return expressionRows;
+    }
+    /** The particle on which an entry of an expression's row acts. */
+    int getParticleOf(int entry) const {
+        return expressionEntries[entry - getNumConstraints()].particle;
+    }
+    /** The constraint that an entry of a Jacobian belongs to. */
+    int getConstraintOf(int entry) const {
+        return entry < getNumConstraints() ? entry : expressionEntries[entry - getNumConstraints()].constraint;
+    }
+    /** Change the parameters of an expression, counted in the order of the constructor. */
+    void setParameters(int expression, const std::map<std::string, double>& parameters);
+    /** A constraint in words, for messages. */
+    std::string describe(int index) const;
     const std::vector<Cluster>& getClusters() const {
         return clusters;
     }
@@ -112,15 +161,24 @@ public:
     /** The particles of a cluster, in increasing order. */
     std::vector<int> getClusterParticles(int cluster) const;
 
-    /** g(q) in g; returns max |g|, the largest relative error of a constraint (or a NaN). */
-    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, int first = 0) const;
-    /** The index of the constraint with the largest |g|. */
-    int findLargest(const std::vector<double>& g) const;
     /**
-     * G(x): for x = q the Jacobian, for x = v the matrix whose rows are (d^2g/dq^2 v)^T, since a distance constraint
-     * is quadratic (paper, Lemma 4.1).
+     * g(q) in g.
+     *
+     * @param nearby    the Jacobian at q or nearby, which gives the errors of expressions their length
+     * @return the largest relative error of a constraint, or a NaN
      */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, int first = 0) const;
+    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, const Jacobian& nearby,
+                    int first = 0) const;
+    /** The index of the constraint with the largest relative error. */
+    int findLargest(const std::vector<double>& g, const Jacobian& nearby) const;
+    /** G(q), the Jacobian. */
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, int first = 0) const;
+    /**
+     * G(v), the matrix whose rows are (d^2g/dq^2 v)^T at q: half the derivative of g''(v,v) with respect to v. For distance
+     * constraints it is the Jacobian with v in place of q, since they are quadratic (paper, Lemma 4.1).
+     */
+    void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                                  Jacobian& jacobian, int first = 0) const;
     /** G w. */
     void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
                   int first = 0) const;
@@ -132,28 +190,67 @@ public:
     /** result += scale M^-1 G^T x. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
                                std::vector<OpenMM::Vec3>& result, int first = 0) const;
-    /** g''(v,v), the second derivative of the constraints along v. */
-    void evaluateCurvature(const std::vector<OpenMM::Vec3>& v, std::vector<double>& result, int first = 0) const;
-    /** The factor that turns a multiplier of constraint index into that of |r|^2 - L^2 (kJ/mol/nm^2). */
-    double toDistanceMultiplier(int index) const {
-        return distanceMultiplierFactors[index];
+    /** g''(v,v), the second derivative of the constraints along v at q. */
+    void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                           std::vector<double>& result, int first = 0) const;
+    /**
+     * The factor that turns a multiplier of constraint index into that of the constraint as users see it: |r|^2 - L^2
+     * (kJ/mol/nm^2) for a distance, and the expression itself (kJ/mol over the unit of g), whose factor is 1.
+     */
+    double toGivenMultiplier(int index) const {
+        return multiplierFactors[index];
     }
-    /** Bring multipliers into the order of the constructor and the units kJ/mol/nm^2. */
-    void getDistanceMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
+    /** Bring multipliers into the order of the constructor, distances first, and into the users' units. */
+    void getGivenMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
+    /** Say in words what is wrong with a constraint whose gradient is zero or not finite; empty if neither is so. */
+    std::string explainGradient(int index, const Jacobian& jacobian) const;
 
 private:
-    std::vector<std::vector<int>> findClusters(const std::vector<DistanceConstraint>& given) const;
-    void orderForElimination(const std::vector<DistanceConstraint>& given, std::vector<int>& cluster) const;
-    void appendCluster(const std::vector<DistanceConstraint>& given, const std::vector<int>& cluster);
+    /** A stretch of distance constraints in the internal order: first, ..., end - 1. */
+    struct Stretch {
+        int first, end;
+    };
+    /** What the constructor works on: constraints of both kinds, distances first. */
+    struct Given {
+        const std::vector<DistanceConstraint>& distances;
+        const std::vector<ExpressionConstraint>& expressions;
+        int getSize() const {
+            return (int) (distances.size() + expressions.size());
+        }
+        bool isExpression(int k) const {
+            return k >= (int) distances.size();
+        }
+        const ExpressionConstraint& getExpression(int k) const {
+            return expressions[k - distances.size()];
+        }
+    };
+    std::vector<int> findMovingParticles(const Given& given, int k) const;
+    std::vector<std::vector<int>> findClusters(const Given& given) const;
+    void orderForElimination(const Given& given, std::vector<int>& cluster) const;
+    std::vector<int> walkThroughParticles(const Given& given, const std::vector<int>& cluster,
+                                          const std::map<int, std::vector<int>>& constraintsOf) const;
+    std::vector<int> walkThroughConstraints(const Given& given, const std::vector<int>& cluster,
+                                            const std::map<int, std::vector<int>>& constraintsOf) const;
+    void appendCluster(const Given& given, const std::vector<int>& cluster);
+    void groupExpressions(const Given& given);
+    void findStretches();
     void findCouplings();
     void classifyParticles(const std::vector<char>& isInBatch);
     void findBlocks();
-    int numGivenConstraints, firstGeneral;
+    void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, int first) const;
+    double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
+    int numGivenConstraints, numGivenDistances, firstGeneral;
     bool isFreeToTranslate;
     std::vector<double> masses, inverseMasses;
-    std::vector<DistanceConstraint> constraints;
-    std::vector<int> givenIndex; // internal order -> order of the constructor
-    std::vector<double> inverseSquareLengths, distanceMultiplierFactors;
+    std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning
+    std::vector<int> givenIndex;                 // internal order -> order of the constructor
+    std::vector<double> inverseSquareLengths, multiplierFactors;
+    std::vector<Stretch> distanceStretches;
+    std::vector<ExpressionConstraint> expressions; // in the order of the constructor
+    std::vector<std::unique_ptr<ExpressionGroup>> groups;
+    std::vector<std::pair<int, int>> placeInGroups; // group and number therein of each expression
+    std::vector<ExpressionRow> expressionRows;
+    std::vector<ExpressionEntry> expressionEntries;
     std::vector<Cluster> clusters;
     std::vector<Coupling> couplings;
     std::vector<std::unique_ptr<ClusterBatch>> batches;

@@ -22,7 +22,8 @@ NewtonMatrix::NewtonMatrix(const ConstraintSystem& system) : system(system) {
         block.first = cluster.first;
         block.size = cluster.size;
         block.firstCoupling = coupling;
-        while (coupling < couplings.size() && couplings[coupling].row < cluster.first + cluster.size)
+        while (coupling < couplings.size() &&
+               system.getConstraintOf(couplings[coupling].row) < cluster.first + cluster.size)
             coupling++;
         block.endCoupling = coupling;
         blocks.push_back(std::move(block));
@@ -37,9 +38,10 @@ bool NewtonMatrix::factorize(const ConstraintSystem::Jacobian& next, const Const
         if (isDense)
             block.dense.setZero(block.size, block.size);
         for (size_t c = block.firstCoupling; c < block.endCoupling; c++) {
-            int row = couplings[c].row, column = couplings[c].column, first = block.first;
-            double lower = couplings[c].factor * next[row].dot(current[column]);
-            double upper = couplings[c].factor * next[column].dot(current[row]);
+            const int a = couplings[c].row, b = couplings[c].column; // entries of the Jacobians
+            const int row = system.getConstraintOf(a), column = system.getConstraintOf(b), first = block.first;
+            double lower = couplings[c].factor * next[a].dot(current[b]);
+            double upper = couplings[c].factor * next[b].dot(current[a]);
             if (isDense) {
                 block.dense(row - first, column - first) += lower;
                 if (row != column)

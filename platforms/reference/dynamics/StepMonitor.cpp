@@ -54,7 +54,7 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 StepMonitor::StepMonitor(const ConstraintSystem& system) :
         system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
         maxForce(0), forcePNorm(0), constraintForceSquared(0), toSolve(system.getNumConstraints()),
-        solved(system.getNumConstraints()), velocityJacobian(system.getNumConstraints()) {
+        solved(system.getNumConstraints()), velocityJacobian(system.getNumEntries()) {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms, double order) {
@@ -162,16 +162,16 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
         switch (terms[i].kind) {
         case ConstraintMultipliers:
             sum = sumOf(numConstraints, [&](int k) {
-                double d = system.toDistanceMultiplier(k);
+                double d = system.toGivenMultiplier(k);
                 return d * d * multipliers[k] * multiplierRate[k];
             });
             rate += factor * sum / value;
             break;
         case MultiplierPNorm:
             for (int k = 0; k < numConstraints; k++) {
-                double x = system.toDistanceMultiplier(k) * multipliers[k];
-                sum += std::copysign(std::pow(std::fabs(x) / value, normOrder - 1), x) *
-                       system.toDistanceMultiplier(k) * multiplierRate[k];
+                double x = system.toGivenMultiplier(k) * multipliers[k];
+                sum += std::copysign(std::pow(std::fabs(x) / value, normOrder - 1), x) * system.toGivenMultiplier(k) *
+                       multiplierRate[k];
             }
             rate += factor * sum;
             break;
@@ -209,10 +209,10 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
 double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const vector<double>& multipliers) const {
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
-    auto distanceMultiplier = [&](int k) { return multipliers[k] * system.toDistanceMultiplier(k); };
+    auto givenMultiplier = [&](int k) { return multipliers[k] * system.toGivenMultiplier(k); };
     switch (term.kind) {
     case ConstraintMultipliers: // (4.4)
-        return std::sqrt(sumOf(numConstraints, [&](int k) { return distanceMultiplier(k) * distanceMultiplier(k); }));
+        return std::sqrt(sumOf(numConstraints, [&](int k) { return givenMultiplier(k) * givenMultiplier(k); }));
     case ConstraintForce:
         return std::sqrt(constraintForceSquared);
     case AppliedForce:
@@ -220,7 +220,7 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
     case ConstraintAndAppliedForce:
         return std::sqrt(constraintForceSquared + appliedForceSquared);
     case MultiplierPNorm:
-        return pNorm(numConstraints, normOrder, [&](int k) { return std::fabs(distanceMultiplier(k)); });
+        return pNorm(numConstraints, normOrder, [&](int k) { return std::fabs(givenMultiplier(k)); });
     case ForcePNorm:
         return forcePNorm;
     case VectorField: // (4.1)
@@ -243,7 +243,8 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
     return 0;
 }
 
-bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v) const {
+bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v,
+                               const ConstraintSystem::Jacobian& jacobian) const {
     if (!(value > 0))
         return true;
     Kind kind = terms[index].kind;
@@ -251,16 +252,30 @@ bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v) c
         return false;
     // Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
     double largest = 0;
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    auto forceOn = [&](int i, double length) {
+        return std::sqrt((*forces)[i].dot((*forces)[i])) + v[i].dot(v[i]) / (inverseMasses[i] * length);
+    };
     for (int k = 0; k < system.getNumConstraints(); k++) {
+        if (system.isExpression(k))
+            continue;
         const DistanceConstraint& c = system.getConstraint(k);
-        for (int i : {c.particle1, c.particle2}) {
-            double speedSquared = v[i].dot(v[i]), inverseMass = system.getInverseMasses()[i];
-            if (inverseMass > 0) {
-                double force = std::sqrt((*forces)[i].dot((*forces)[i])) + speedSquared / (inverseMass * c.length);
-                largest = std::max(largest,
-                                   kind == ConstraintForce ? force * std::sqrt(inverseMass) : force / (2 * c.length));
-            }
+        for (int i : {c.particle1, c.particle2})
+            if (inverseMasses[i] > 0)
+                largest = std::max(largest, kind == ConstraintForce ? forceOn(i, c.length) * std::sqrt(inverseMasses[i])
+                                                                    : forceOn(i, c.length) / (2 * c.length));
+    }
+    for (const ConstraintSystem::ExpressionRow& row : system.getExpressionRows()) {
+        double product = 0, square = 0; // G M^-1 F without cancellation, and the diagonal of K
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = system.getParticleOf(entry);
+            if (inverseMasses[i] == 0)
+                continue;
+            const double rowSquared = jacobian[entry].dot(jacobian[entry]);
+            product += std::sqrt(rowSquared) * forceOn(i, ConstraintSystem::EXPRESSION_LENGTH) * inverseMasses[i];
+            square += rowSquared * inverseMasses[i];
         }
+        largest = std::max(largest, product / (kind == ConstraintForce ? std::sqrt(square) : square));
     }
     return value <= 1e-12 * largest;
 }
@@ -277,7 +292,7 @@ double StepMonitor::combine(const vector<double>& values) const {
     return std::sqrt(sum / sumOfWeights);
 }
 
-void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& multipliers,
+void StepMonitor::evaluateGradient(const vector<Vec3>& q, const vector<Vec3>& v, const vector<double>& multipliers,
                                    const vector<double>& values, const ConstraintMatrix& matrix,
                                    vector<Vec3>& gradient) {
     const vector<double>& masses = system.getMasses();
@@ -297,14 +312,14 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& 
         case ConstraintMultipliers:
             mustSolve = true;
             for (int k = 0; k < numConstraints; k++) {
-                double d = system.toDistanceMultiplier(k);
+                double d = system.toGivenMultiplier(k);
                 toSolve[k] += factor / value * d * d * multipliers[k];
             }
             break;
         case MultiplierPNorm:
             mustSolve = true;
             for (int k = 0; k < numConstraints; k++) {
-                double d = system.toDistanceMultiplier(k), size = std::fabs(d * multipliers[k]);
+                double d = system.toGivenMultiplier(k), size = std::fabs(d * multipliers[k]);
                 double derivative = d * std::pow(size / value, normOrder - 1);
                 toSolve[k] += factor * (multipliers[k] < 0 ? -derivative : derivative);
             }
@@ -344,7 +359,7 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& v, const vector<double>& 
             solved[k] += toSolve[k];
     }
     // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-    system.evaluateJacobian(v, velocityJacobian);
+    system.evaluateVelocityJacobian(q, v, velocityJacobian);
     for (double& x : solved)
         x *= 2;
     system.addTransposed(velocityJacobian, solved, gradient);

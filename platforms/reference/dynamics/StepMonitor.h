@@ -106,21 +106,23 @@ public:
                         const std::vector<double>& rightSide, const std::vector<double>& values,
                         const std::vector<OpenMM::Vec3>& velocityRate, const std::vector<double>& multiplierRate) const;
     /** Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls. */
-    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v) const;
+    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v,
+                      const ConstraintSystem::Jacobian& jacobian) const;
     /** u, the combination of the values; 1 if there is no term. */
     double combine(const std::vector<double>& values) const;
     /**
      * du/dv at the state of the last evaluate().
      *
+     * @param q              the positions
      * @param v              as in evaluate()
      * @param multipliers    as in evaluate()
      * @param values         what evaluate() gave
      * @param matrix         the factorised K(q)
      * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
      */
-    void evaluateGradient(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
-                          const std::vector<double>& values, const ConstraintMatrix& matrix,
-                          std::vector<OpenMM::Vec3>& gradient);
+    void evaluateGradient(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                          const std::vector<double>& multipliers, const std::vector<double>& values,
+                          const ConstraintMatrix& matrix, std::vector<OpenMM::Vec3>& gradient);
 
 private:
     double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v,

@@ -47,8 +47,9 @@ double dot(const vector<double>& a, const vector<double>& b) {
 
 } // namespace
 
-VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints) :
-        system(masses, constraints), matrix(system), newtonMatrix(system), monitor(system), automatic(system),
+VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
+                                 const vector<ExpressionConstraint>& expressions) :
+        system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system), automatic(system),
         settings(), groupEnergy(0), rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0),
         densityOffset(0), firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1),
         stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
@@ -65,7 +66,7 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
           &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
-        rows->resize(numConstraints);
+        rows->resize(system.getNumEntries());
 }
 
 void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
@@ -196,7 +197,7 @@ void VRattleDynamics::projectVelocities(vector<Vec3>& velocities) {
 // u(q,p) with Lambda = K^-1 (g''(v,v) + G M^-1 F)   (4.3)
 double VRattleDynamics::evaluateU(const vector<Vec3>& velocities) {
     ensureFactor(FullFactor);
-    system.evaluateCurvature(velocities, rightSideTrial);
+    system.evaluateCurvature(q, velocities, rightSideTrial);
     for (size_t k = 0; k < rightSideTrial.size(); k++)
         rightSideTrial[k] += appliedTerm[k];
     multiplierTrial = rightSideTrial;
@@ -258,7 +259,7 @@ void VRattleDynamics::evaluateOnStepGeneral(const OnStepArrays& arrays, const ve
     system.addTransposedOverMass(jacobianNext, correction, -1.0, velocities, first);
     system.multiplyOverMass(jacobianNext, forces, appliedTermNext, first);
     auto computeMultipliers = [&](const vector<Vec3>& at, vector<double>& right, vector<double>& result) {
-        system.evaluateCurvature(at, right, first);
+        system.evaluateCurvature(positions, at, right, first);
         for (int k = first; k < end; k++)
             result[k] = right[k] += appliedTermNext[k];
         matrix.solve(result, first);
@@ -271,7 +272,7 @@ void VRattleDynamics::evaluateOnStepGeneral(const OnStepArrays& arrays, const ve
     for (int i : system.getGeneralParticles())
         acceleration[i] = forces[i] * inverseMasses[i];
     system.addTransposedOverMass(jacobianNext, multipliers, -1.0, acceleration, first);
-    system.evaluateJacobian(velocities, velocityJacobian, first);
+    system.evaluateVelocityJacobian(positions, velocities, velocityJacobian, first);
     system.multiply(velocityJacobian, acceleration, lambdaRate, first);
     for (int k = first; k < end; k++)
         lambdaRate[k] *= 2;
@@ -292,17 +293,19 @@ double VRattleDynamics::evaluateRate() {
 }
 
 bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
-    if (system.getNumConstraints() == 0 || system.evaluate(positions, residual) <= settings.tolerance)
+    if (system.getNumConstraints() == 0)
+        return false;
+    factorScope = NoFactor;
+    system.evaluateJacobian(positions, jacobian);
+    if (system.evaluate(positions, residual, jacobian) <= settings.tolerance)
         return false;
     // Newton's iteration for g(q + M^-1 G(q)^T x) = 0 with the chord matrix K(q), then with the full one.
-    factorScope = NoFactor;
-    system.evaluateJacobian(positions, jacobianNext);
-    matrix.factorize(jacobianNext);
+    matrix.factorize(jacobian);
     qNext = positions;
     bool isNewton = false;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
-        lastError = system.evaluate(qNext, residual);
+        lastError = system.evaluate(qNext, residual, jacobian);
         if (!std::isfinite(lastError))
             break;
         const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
@@ -314,14 +317,14 @@ bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
         previous = lastError;
         correction = residual;
         if (isNewton) {
-            system.evaluateJacobian(qNext, jacobian);
-            if (!newtonMatrix.factorize(jacobian, jacobianNext))
+            system.evaluateJacobian(qNext, jacobianNext);
+            if (!newtonMatrix.factorize(jacobianNext, jacobian))
                 break;
             newtonMatrix.solve(correction);
         }
         else
             matrix.solve(correction);
-        system.addTransposedOverMass(jacobianNext, correction, -1.0, qNext);
+        system.addTransposedOverMass(jacobian, correction, -1.0, qNext);
         numIterations++;
     }
     throwNotConverged();
@@ -573,7 +576,7 @@ double VRattleDynamics::solveGeneral(const vector<Vec3>& start, double kick, dou
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0;; iteration++) {
         computeTrial(start, kick, drift, system.getGeneralParticles(), first);
-        const double error = system.evaluate(qNext, residual, first);
+        const double error = system.evaluate(qNext, residual, jacobian, first);
         // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance. Where the error
         // is no longer reduced it is rounding, or Newton's to deal with.
         if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous) || iteration == MAX_CHORD_ITERATIONS)) {
@@ -602,7 +605,7 @@ bool VRattleDynamics::iterateNewton(const vector<Vec3>& start, double kick, doub
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         computeTrial(start, kick, drift, movingParticles, 0);
-        lastError = system.evaluate(qNext, residual);
+        lastError = system.evaluate(qNext, residual, jacobian);
         if (!std::isfinite(lastError))
             return false;
         const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
@@ -674,8 +677,8 @@ double VRattleDynamics::coupledPassGeneral(double kick, double drift) {
     for (int k = first; k < end; k++)
         lambdaNext[k] += correction[k];
     computeTrial(w, kick, drift, system.getGeneralParticles(), first);
-    const double error = system.evaluate(qNext, residual, first);
-    system.evaluateCurvature(wNext, rightSideTrial, first);
+    const double error = system.evaluate(qNext, residual, jacobian, first);
+    system.evaluateCurvature(q, wNext, rightSideTrial, first);
     for (int k = first; k < end; k++) {
         multiplierTrial[k] = rightSideTrial[k] += appliedTerm[k];
         correction[k] = residual[k] / (kick * drift);
@@ -700,7 +703,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
         computeTrial(w, kick, drift, movingParticles, 0);
-        lastError = system.evaluate(qNext, residual);
+        lastError = system.evaluate(qNext, residual, jacobian);
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
@@ -718,7 +721,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         if (!newtonMatrix.factorize(jacobianNext, jacobian))
             return NotConverged;
         // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-        monitor.evaluateGradient(wNext, multiplierTrial, valuesTrial, matrix, gradient);
+        monitor.evaluateGradient(q, wNext, multiplierTrial, valuesTrial, matrix, gradient);
         const double derivative = density.limitDerivative(monitor.combine(valuesTrial));
         system.multiplyOverMass(jacobian, gradient, coupling);
         for (double& a : coupling)
@@ -787,11 +790,11 @@ double VRattleDynamics::solveRegular() {
 
 void VRattleDynamics::throwNotConverged() const {
     std::stringstream reason;
-    if (std::isfinite(lastError)) {
-        const DistanceConstraint& worst = system.getConstraint(system.findLargest(residual));
-        reason << "the constrained distance between the particles " << worst.particle1 << " and " << worst.particle2
-               << " could not be solved for (relative error " << lastError << " left)";
-    }
+    const int worst = system.findLargest(residual, jacobian);
+    if (std::isfinite(lastError))
+        reason << system.describe(worst) << " could not be solved for (relative error " << lastError << " left)";
+    else if (system.isExpression(worst) && !std::isfinite(residual[worst]))
+        reason << system.describe(worst) << " became " << residual[worst];
     else
         reason << "the constraints could not be solved for (the iteration diverged)";
     if (hasDensity && settings.isAutomatic)
@@ -977,7 +980,7 @@ bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const 
     for (size_t k = 0; k < terms.size(); k++) {
         if (terms[k].reference > 0)
             areAllTaken = false;
-        else if (monitor.isNegligible((int) k, values[k], v))
+        else if (monitor.isNegligible((int) k, values[k], v, jacobian))
             throw StepFailure(
                 "monitor " + std::to_string(k) +
                 " is zero at the first step, which is then no measure for later ones; call calibrate() or "

@@ -64,7 +64,8 @@ public:
         AutomaticControl::Memory automatic; // of automatic step control
     };
 
-    VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints);
+    VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                    const std::vector<ExpressionConstraint>& expressions = {});
 
     /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
     typedef std::function<void(const std::function<void(int)>&)> Parallel;
@@ -94,6 +95,10 @@ public:
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     Memory getMemory() const;
+    /** Change the parameters of an expression, before the next begin(). */
+    void setParameters(int expression, const std::map<std::string, double>& parameters) {
+        system.setParameters(expression, parameters);
+    }
     /**
      * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
      * following steps are the same to the last bit if the forces are.
@@ -184,7 +189,7 @@ public:
     double getReference(int index) const {
         return settings.isAutomatic ? automatic.getReference(index) : monitor.getTerms()[index].reference;
     }
-    /** Lambda(q[n],p[n]) for the relative form of the constraints, in internal order. */
+    /** Lambda(q[n],p[n]) for the constraints as ConstraintSystem writes them, in internal order. */
     const std::vector<double>& getMultipliers() const {
         return lambda;
     }

@@ -99,6 +99,21 @@ bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
     return true;
 }
 
+vector<ExpressionConstraint> readExpressions(const VariableStepRattleIntegrator& integrator) {
+    vector<ExpressionConstraint> result(integrator.getNumExpressionConstraints());
+    for (size_t i = 0; i < result.size(); i++)
+        integrator.getExpressionConstraintParameters((int) i, result[i].expression, result[i].particles,
+                                                     result[i].parameters);
+    return result;
+}
+
+// Whether two constraints are the same but for the values of their parameters.
+bool areAlike(const ExpressionConstraint& a, const ExpressionConstraint& b) {
+    return a.expression == b.expression && a.particles == b.particles && a.parameters.size() == b.parameters.size() &&
+           std::equal(a.parameters.begin(), a.parameters.end(), b.parameters.begin(),
+                      [](const auto& x, const auto& y) { return x.first == y.first; });
+}
+
 } // namespace
 
 void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
@@ -114,6 +129,7 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
             throw OpenMMException("VariableStepRattleIntegrator: constraint " + std::to_string(i) +
                                   " of the System has a length that is not a positive finite number");
     }
+    expressions = readExpressions(integrator);
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
     mayForcesChangePositions = mayForcesChangeVelocities = false;
     for (int i = 0; i < system.getNumForces(); i++) {
@@ -121,8 +137,8 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
         mayForcesChangePositions = mayForcesChangePositions || reach == FullReach;
         mayForcesChangeVelocities = mayForcesChangeVelocities || reach != NoReach;
     }
-    systemFingerprint = VRattleRunState::fingerprintOf(system);
-    dynamics.reset(new VRattleDynamics(masses, constraints));
+    systemFingerprint = VRattleRunState::fingerprintOf(system, integrator);
+    dynamics.reset(new VRattleDynamics(masses, constraints, expressions));
     trial.reset();
     if (getPlatform().getName() != "Reference") { // which does everything on one thread
         auto runOnThreads = [this](const std::function<void(int)>& task) {
@@ -184,7 +200,25 @@ void ReferenceIntegrateVRattleStepKernel::readSettings(const VariableStepRattleI
     catch (const StepFailure& failure) {
         throw OpenMMException(std::string("VariableStepRattleIntegrator: ") + failure.what());
     }
+    readParametersOfExpressions(integrator);
     areSettingsChanged = false;
+}
+
+// New values take effect at once, other constraints with Context::reinitialize().
+void ReferenceIntegrateVRattleStepKernel::readParametersOfExpressions(const VariableStepRattleIntegrator& integrator) {
+    const vector<ExpressionConstraint> current = readExpressions(integrator);
+    areExpressionsOutdated =
+        !std::equal(current.begin(), current.end(), expressions.begin(), expressions.end(), areAlike);
+    if (areExpressionsOutdated)
+        return;
+    for (size_t i = 0; i < current.size(); i++)
+        if (current[i].parameters != expressions[i].parameters) {
+            expressions[i].parameters = current[i].parameters;
+            dynamics->setParameters((int) i, current[i].parameters);
+            if (trial != nullptr)
+                trial->setParameters((int) i, current[i].parameters);
+            isStateChanged = true;
+        }
 }
 
 // Bring the method's state in line with the Context, which may have been changed in between.
@@ -193,6 +227,9 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
     takeRestored(context);
     if (areSettingsChanged)
         readSettings(integrator);
+    if (areExpressionsOutdated)
+        throw OpenMMException("VariableStepRattleIntegrator: constraints have been added or replaced since the Context "
+                              "was created; call reinitialize(preserveState=True) of the Context to use them");
     int groups = integrator.getIntegrationForceGroups();
     if (monitorForceGroup != NO_MONITOR_GROUP)
         groups &= ~(1 << monitorForceGroup);
@@ -398,7 +435,7 @@ vector<double> ReferenceIntegrateVRattleStepKernel::calibrate(ContextImpl& conte
 VRattleDynamics& ReferenceIntegrateVRattleStepKernel::beginTrial(const VRattleDynamics::Settings& trialSettings,
                                                                  double direction) {
     if (trial == nullptr)
-        trial.reset(new VRattleDynamics(masses, constraints));
+        trial.reset(new VRattleDynamics(masses, constraints, expressions));
     trial->setSettings(trialSettings);
     vector<Vec3> velocities = dynamics->getVelocities();
     for (Vec3& v : velocities)
@@ -712,7 +749,7 @@ vector<double> ReferenceIntegrateVRattleStepKernel::getMultipliers(ContextImpl& 
                                                                    const VariableStepRattleIntegrator& integrator) {
     prepare(context, integrator, false);
     vector<double> result;
-    dynamics->getConstraintSystem().getDistanceMultipliers(dynamics->getMultipliers(), result);
+    dynamics->getConstraintSystem().getGivenMultipliers(dynamics->getMultipliers(), result);
     return result;
 }
 

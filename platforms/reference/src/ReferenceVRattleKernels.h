@@ -48,6 +48,7 @@ public:
 
 private:
     void readSettings(const VariableStepRattleIntegrator& integrator);
+    void readParametersOfExpressions(const VariableStepRattleIntegrator& integrator);
     void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
     void startAfresh(OpenMM::ContextImpl& context);
     VRattleDynamics::Memory memoryOf(const VRattleRunState& run, bool isAutomatic) const;
@@ -71,6 +72,8 @@ private:
     OpenMM::ReferencePlatform::PlatformData& data;
     std::vector<double> masses;
     std::vector<DistanceConstraint> constraints;
+    std::vector<ExpressionConstraint> expressions;
+    bool areExpressionsOutdated; // the integrator's are others by now
     unsigned long long systemFingerprint;
     std::unique_ptr<VRattleDynamics> dynamics;
     VRattleDynamics::Settings settings;

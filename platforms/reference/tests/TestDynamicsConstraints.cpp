@@ -98,19 +98,19 @@ void testJacobianIsDerivative() {
     ConstraintSystem system(e.masses, e.constraints);
     const int m = system.getNumConstraints();
     vector<double> plus(m), minus(m), derivative(m), curvature(m), zero(m);
-    assertSmall(system.evaluate(e.positions, zero), 1e-14);
+    ConstraintSystem::Jacobian jacobian(m);
+    system.evaluateJacobian(e.positions, jacobian);
+    assertSmall(system.evaluate(e.positions, zero, jacobian), 1e-14);
     const double h = 1e-4;
     vector<Vec3> ahead = e.positions, back = e.positions;
     for (size_t i = 0; i < ahead.size(); i++) {
         ahead[i] += e.velocities[i] * h;
         back[i] -= e.velocities[i] * h;
     }
-    system.evaluate(ahead, plus);
-    system.evaluate(back, minus);
-    ConstraintSystem::Jacobian jacobian(m);
-    system.evaluateJacobian(e.positions, jacobian);
+    system.evaluate(ahead, plus, jacobian);
+    system.evaluate(back, minus, jacobian);
     system.multiply(jacobian, e.velocities, derivative);
-    system.evaluateCurvature(e.velocities, curvature);
+    system.evaluateCurvature(e.positions, e.velocities, curvature);
     // A distance constraint is quadratic, so central differences are exact but for rounding.
     for (int k = 0; k < m; k++) {
         ASSERT_EQUAL_TOL((plus[k] - minus[k]) / (2 * h), derivative[k], 1e-8);
@@ -174,7 +174,7 @@ void testMasslessParticles() {
     ASSERT_EQUAL(1, system.getNumConstraints());
     ASSERT_EQUAL(2, system.getNumGivenConstraints());
     vector<double> multipliers;
-    system.getDistanceMultipliers({3.0}, multipliers);
+    system.getGivenMultipliers({3.0}, multipliers);
     ASSERT_EQUAL_TOL(1.5, multipliers[0], 1e-15);
     ASSERT_EQUAL(0.0, multipliers[1]);
 }

@@ -31,6 +31,7 @@ struct Example {
     }
     vector<double> masses;
     vector<DistanceConstraint> constraints;
+    vector<ExpressionConstraint> expressions;
     vector<Vec3> positions, velocities, forces;
 };
 
@@ -38,8 +39,8 @@ struct Example {
 class Evaluation {
 public:
     Evaluation(const Example& e, const vector<StepMonitor::Term>& terms, double order) :
-            e(e), system(e.masses, e.constraints), matrix(system), monitor(system),
-            jacobian(system.getNumConstraints()), applied(system.getNumConstraints()),
+            e(e), system(e.masses, e.constraints, e.expressions), matrix(system), monitor(system),
+            jacobian(system.getNumEntries()), applied(system.getNumConstraints()),
             multipliers(system.getNumConstraints()) {
         system.evaluateJacobian(e.positions, jacobian);
         matrix.factorize(jacobian);
@@ -48,7 +49,7 @@ public:
         monitor.setForces(e.forces, 4.2);
     }
     double u(const vector<Vec3>& v) {
-        system.evaluateCurvature(v, multipliers);
+        system.evaluateCurvature(e.positions, v, multipliers);
         for (size_t k = 0; k < multipliers.size(); k++)
             multipliers[k] += applied[k];
         rightSide = multipliers;
@@ -60,8 +61,9 @@ public:
     double rate(const vector<Vec3>& v, const vector<Vec3>& change) {
         u(v);
         vector<double> multiplierRate(multipliers.size());
-        system.evaluateJacobian(v, jacobian);
-        system.multiply(jacobian, change, multiplierRate);
+        ConstraintSystem::Jacobian velocityJacobian(system.getNumEntries());
+        system.evaluateVelocityJacobian(e.positions, v, velocityJacobian);
+        system.multiply(velocityJacobian, change, multiplierRate);
         for (double& x : multiplierRate)
             x *= 2;
         matrix.solve(multiplierRate);
@@ -70,7 +72,7 @@ public:
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
         vector<Vec3> result(v.size());
-        monitor.evaluateGradient(v, multipliers, values, matrix, result);
+        monitor.evaluateGradient(e.positions, v, multipliers, values, matrix, result);
         return result;
     }
     const Example& e;
@@ -147,12 +149,12 @@ void testNegligibleMultipliers() {
     Evaluation evaluation(
         e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
     evaluation.u(e.velocities);
-    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities));
-    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities));
+    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
+    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
     e.velocities[0] = Vec3(0.3, 0.4001, 0);
     evaluation.u(e.velocities);
-    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities));
-    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities));
+    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
+    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
 }
 
 void testBounds() {

@@ -131,7 +131,7 @@ void testShapes(StepDensity::Update update) {
             ASSERT(takeStep(dynamics));
             Eigen::VectorXd expected = denseMultipliers(e, dynamics);
             vector<double> found;
-            dynamics.getConstraintSystem().getDistanceMultipliers(dynamics.getMultipliers(), found);
+            dynamics.getConstraintSystem().getGivenMultipliers(dynamics.getMultipliers(), found);
             for (int k = 0; k < expected.size(); k++)
                 ASSERT(std::fabs(found[k] - expected[k]) <= 1e-9 * expected.norm());
             ASSERT_EQUAL_TOL(expected.norm(), dynamics.getMonitorValues()[0], 1e-10);

@@ -1,0 +1,68 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "ExpressionCheck.h"
+#include "lepton/ExpressionTreeNode.h"
+#include "lepton/Operation.h"
+#include "lepton/ParsedExpression.h"
+#include "lepton/Parser.h"
+#include "openmm/OpenMMException.h"
+#include <cstdlib>
+#include <set>
+
+using Lepton::ExpressionTreeNode;
+using Lepton::Operation;
+using OpenMM::OpenMMException;
+using std::string;
+
+namespace OpenMMVRattle {
+
+namespace {
+
+void findVariables(const ExpressionTreeNode& node, std::set<string>& variables) {
+    if (node.getOperation().getId() == Operation::VARIABLE)
+        variables.insert(node.getOperation().getName());
+    for (const ExpressionTreeNode& child : node.getChildren())
+        findVariables(child, variables);
+}
+
+// The number of the particle whose coordinate a name is (x1, y1, z1, x2, ...); 0 if it is no coordinate.
+int particleOfCoordinate(const string& name) {
+    if (name.size() < 2 || name.size() > 10 || name[0] < 'x' || name[0] > 'z' || name[1] == '0' ||
+        name.find_first_not_of("0123456789", 1) != string::npos)
+        return 0;
+    return std::atoi(name.c_str() + 1);
+}
+
+} // namespace
+
+void requireValidExpression(const string& expression, int numParticles, const std::map<string, double>& parameters) {
+    const string constraint = "VariableStepRattleIntegrator: the constraint \"" + expression + "\" ";
+    std::set<string> variables;
+    try {
+        findVariables(Lepton::Parser::parse(expression).getRootNode(), variables);
+    }
+    catch (const std::exception& e) {
+        throw OpenMMException(constraint + "cannot be understood: " + e.what());
+    }
+    for (const auto& parameter : parameters)
+        if (particleOfCoordinate(parameter.first) > 0)
+            throw OpenMMException(constraint + "has a parameter " + parameter.first +
+                                  ", which is the name of a coordinate; give it another name");
+    bool hasCoordinate = false;
+    for (const string& name : variables) {
+        const int particle = particleOfCoordinate(name);
+        if (particle > numParticles)
+            throw OpenMMException(constraint + "contains " + name + " and is of " + std::to_string(numParticles) +
+                                  (numParticles == 1 ? " particle" : " particles") +
+                                  " alone; name as many particles as it contains");
+        if (particle == 0 && parameters.count(name) == 0)
+            throw OpenMMException(constraint + "contains the variable " + name +
+                                  ", which is neither a coordinate (x1, y1, z1, x2, ...) nor one of its parameters");
+        hasCoordinate |= particle > 0;
+    }
+    if (!hasCoordinate)
+        throw OpenMMException(constraint + "contains no coordinate (x1, y1, z1, x2, ...) and so constrains nothing");
+}
+
+} // namespace OpenMMVRattle

@@ -1,0 +1,83 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_EXPRESSIONGROUP_H_
+#define OPENMMVRATTLE_EXPRESSIONGROUP_H_
+
+#include "ArrayExpression.h"
+#include "openmm/Vec3.h"
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/** A constraint g(x1, y1, z1, x2, ...) = 0 of the positions of some particles (nm), given as an expression. */
+struct ExpressionConstraint {
+    std::string expression;
+    std::vector<int> particles;
+    std::map<std::string, double> parameters;
+};
+
+/**
+ * The constraints that share an expression, a number of particles and the names of their parameters. The expression is parsed
+ * and differentiated once, and evaluated for all of them together.
+ *
+ * A constraint of n particles has n neighbouring entries in a Jacobian, one for each particle in the constraint's order. Those
+ * of particles without mass are zero.
+ */
+class ExpressionGroup {
+public:
+    /** @param example    a constraint of the group */
+    explicit ExpressionGroup(const ExpressionConstraint& example);
+    /**
+     * Add a constraint, all of them before the first evaluation.
+     *
+     * @param constraint        the constraint
+     * @param index             its place in arrays of constraints
+     * @param firstEntry        the place of its first entry in a Jacobian
+     * @param inverseMasses     1/mass of every particle of the system; 0 for one that does not move
+     */
+    void add(const ExpressionConstraint& constraint, int index, int firstEntry,
+             const std::vector<double>& inverseMasses);
+    /** Change the parameters of the constraint that was added as the n-th. */
+    void setParameters(int n, const std::map<std::string, double>& parameters);
+
+    /** g(q) */
+    void evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g);
+    /** The rows of G(q) = dg/dq. */
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, std::vector<OpenMM::Vec3>& jacobian);
+    /** g''(v,v) at q. */
+    void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                           std::vector<double>& result);
+    /** The rows (d^2g/dq^2 v)^T at q. */
+    void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                                  std::vector<OpenMM::Vec3>& jacobian);
+
+private:
+    typedef std::unique_ptr<ArrayExpression> Program;
+    Program& require(Program& program, const std::vector<int>& outputs);
+    template <class Store>
+    void run(ArrayExpression& program, const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>* v,
+             const Store& store);
+    void runRows(ArrayExpression& program, const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>* v,
+                 std::vector<OpenMM::Vec3>& jacobian);
+    int getNumConstraints() const {
+        return (int) indices.size();
+    }
+    int numParticles;
+    ExpressionGraph graph;
+    std::vector<int> coordinates, velocities,
+        parameters; // variables of the graph, in this order the inputs of all programs
+    std::vector<std::string> parameterNames;
+    int value, rate, curvature; // nodes: g, its derivative along v, and the derivative of this along v
+    Program valueProgram, jacobianProgram, curvatureProgram, velocityJacobianProgram; // made when they are first needed
+    std::vector<int> indices, firstEntries, particles;
+    std::vector<double> parameterValues;
+    std::vector<char> isMoving; // as particles
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_EXPRESSIONGROUP_H_
