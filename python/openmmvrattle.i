@@ -14,6 +14,8 @@
 
 // Without a name SWIG wraps no class for it, but it turns returned vectors into tuples.
 %template() std::vector<double>;
+%template() std::vector<int>;
+%template() std::vector<std::string>;
 
 %{
 #include "OpenMM.h"
@@ -51,6 +53,26 @@ void setOpenMMException(const char* message) {
     Py_XDECREF(module);
 }
 
+std::map<std::string, double> makeParameters(const std::vector<std::string>& names, const std::vector<double>& values) {
+    std::map<std::string, double> parameters;
+    for (size_t i = 0; i < names.size(); i++)
+        parameters[names[i]] = values[i];
+    return parameters;
+}
+
+/** What a constraint was added with. */
+struct ConstraintParts {
+    std::string expression;
+    std::vector<int> particles;
+    std::map<std::string, double> parameters;
+};
+
+ConstraintParts getConstraintParts(const OpenMMVRattle::VariableStepRattleIntegrator* integrator, int index) {
+    ConstraintParts parts;
+    integrator->getExpressionConstraintParameters(index, parts.expression, parts.particles, parts.parameters);
+    return parts;
+}
+
 } // namespace
 %}
 
@@ -78,6 +100,7 @@ void setOpenMMException(const char* message) {
 }
 %enddef
 RELEASES_GIL(calibrate)
+RELEASES_GIL(getExpressionConstraintMultiplier)
 RELEASES_GIL(getMonitorValue)
 RELEASES_GIL(getMultipliers)
 RELEASES_GIL(reverse)
@@ -91,7 +114,7 @@ RELEASES_GIL(stepTo)
 %pythoncode %{
 import copy
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import openmm
 from openmm import unit
@@ -115,12 +138,40 @@ def _number(value: object, name: str, target: unit.Unit = unit.dimensionless) ->
         raise TypeError(f"{name} must be {wanted}, not {value!r}") from None
 
 
+def _parameter(value: object, name: str) -> float:
+    """Return `value`, a number or a Quantity of any dimension, as a number in OpenMM's unit system."""
+    if unit.is_quantity(value):
+        value = value.value_in_unit_system(unit.md_unit_system)
+    return _number(value, f"the parameter {name}")
+
+
 def _integer(value: object, name: str) -> int:
     """Return `value` as an int, if it is an integer of any kind."""
     try:
         return operator.index(value)
     except TypeError:
         raise TypeError(f"{name} must be an integer, not {value!r}") from None
+
+
+def _constraint_arguments(
+    expression: object, particles: object, parameters: object
+) -> tuple[str, list[int], list[str], list[float]]:
+    """Return the expression, the particles, and the names and values of the parameters of a constraint."""
+    if not isinstance(expression, str):
+        raise TypeError(f"expression must be a string, not {expression!r}")
+    if isinstance(particles, (str, bytes)) or not isinstance(particles, Iterable):
+        raise TypeError(f"particles must be a list of integers, not {particles!r}")
+    if not isinstance(parameters, Mapping):
+        raise TypeError(f"parameters must be a dict of names and values, not {parameters!r}")
+    for name in parameters:
+        if not isinstance(name, str):
+            raise TypeError(f"the name of a parameter must be a string, not {name!r}")
+    return (
+        expression,
+        [_integer(particle, "the index of a particle") for particle in particles],
+        list(parameters),
+        [_parameter(value, name) for name, value in parameters.items()],
+    )
 %}
 
 %feature("docstring") OpenMMVRattle::VariableStepRattleIntegrator "
@@ -216,7 +267,7 @@ def __init__(
     maximumStepSize : float or Quantity
         the largest step size the monitor can ask for (in ps); 0 means no bound. Default: twice stepSize
     constraintTolerance : float
-        the relative tolerance of constrained distances. Default: 1e-8
+        the relative tolerance of the constraints, see setConstraintTolerance(). Default: 1e-8
     monitors : list
         the monitors in place of the default one, ConstraintMultipliers: each a kind, or a tuple (kind, weight, power).
         The empty list means fixed steps: plain RATTLE
@@ -734,14 +785,17 @@ def getMonitorValue(self, index: int = 0) -> float:
 def getMultipliers(self) -> unit.Quantity:
     r"""
     Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in the order
-    of the System's constraints. The force of constraint k, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle
-    i and the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d. Before the first
-    step this computes the forces.
+    of the System's constraints, and behind them those of addConstraint(). The force of constraint k of the System, g =
+    |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle i and the opposite on j: a positive multiplier is a bond
+    under tension, whose tension is 2 Lambda_k d. The force of any constraint g = 0 on a particle is -Lambda_k dg/dq.
+    Before the first step this computes the forces.
 
     Returns
     -------
     Quantity
-        a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles
+        a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles. Those of
+        addConstraint() are numbers in kJ/mol over the unit of the expression, whatever the unit of the list says; see
+        getExpressionConstraintMultiplier()
 
     Raises
     ------
@@ -749,6 +803,67 @@ def getMultipliers(self) -> unit.Quantity:
         if there is no Context
     """
     return unit.Quantity(list($action(self)), _MULTIPLIER_UNIT)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getExpressionConstraintMultiplier %{
+def getExpressionConstraintMultiplier(self, index: int) -> float:
+    r"""
+    Get the Lagrange multiplier of one constraint of addConstraint(); see getMultipliers(). Where the expression is a
+    reaction coordinate minus its value, it is the force that holds the coordinate there, with the sign of a force against
+    g.
+
+    Parameters
+    ----------
+    index : int
+        the index of the constraint, as addConstraint() has returned it
+
+    Returns
+    -------
+    float
+        the multiplier, in kJ/mol over the unit of the expression
+
+    Raises
+    ------
+    OpenMMException
+        if there is no constraint with this index, or no Context
+    """
+    return $action(self, _integer(index, "index"))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumExpressionConstraints %{
+def getNumExpressionConstraints(self) -> int:
+    r"""
+    Get the number of constraints that addConstraint() has added.
+
+    Returns
+    -------
+    int
+        their number
+    """
+    return $action(self)
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setExpressionConstraintParameter %{
+def setExpressionConstraintParameter(self, index: int, name: str, value: float | unit.Quantity) -> None:
+    r"""
+    Change the value of one parameter of a constraint. It is in force at the next step, which starts the run afresh from
+    positions that satisfy the constraint.
+
+    Parameters
+    ----------
+    index : int
+        the index of the constraint
+    name : str
+        the name of the parameter
+    value : float or Quantity
+        its new value, in OpenMM's units (nm, ps, amu, kJ/mol, radian) if it is a number
+
+    Raises
+    ------
+    OpenMMException
+        if there is no constraint with this index, or it has no such parameter, or the value is not finite
+    """
+    $action(self, _integer(index, "index"), name, _parameter(value, name))
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumForceEvaluations %{
@@ -797,12 +912,17 @@ def getNumRescues(self) -> int:
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setConstraintTolerance %{
 def setConstraintTolerance(self, tol: float) -> None:
     r"""
-    Set the relative tolerance of constrained distances. Default: 1e-8.
+    Set the relative tolerance of the constraints. Default: 1e-8.
+
+    For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of 0.1 nm,
+    about the length of a bond, and the error that is compared with it is the distance of the particles from where g = 0
+    holds, to first order: |g| over the Euclidean norm of the gradient of g with respect to the particles that have mass.
+    It is therefore the same for g and for 1000 g.
 
     Parameters
     ----------
     tol : float
-        the tolerance, as a fraction of the constrained distance; positive and finite
+        the tolerance; positive and finite
 
     Raises
     ------
@@ -919,6 +1039,9 @@ public:
     double getStepDensity() const;
     double getMonitorValue(int index = 0) const;
     std::vector<double> getMultipliers() const;
+    double getExpressionConstraintMultiplier(int index) const;
+    int getNumExpressionConstraints() const;
+    void setExpressionConstraintParameter(int index, const std::string& name, double value);
     long long getNumForceEvaluations() const;
     long long getNumSolverIterations() const;
     long long getNumRescues() const;
@@ -933,7 +1056,148 @@ public:
         static OpenMMVRattle::VariableStepRattleIntegrator* _cast(OpenMM::Integrator* integrator) {
             return dynamic_cast<OpenMMVRattle::VariableStepRattleIntegrator*>(integrator);
         }
+        int _addConstraint(const std::string& expression, const std::vector<int>& particles,
+                           const std::vector<std::string>& names, const std::vector<double>& values) {
+            return $self->addConstraint(expression, particles, makeParameters(names, values));
+        }
+        void _setExpressionConstraintParameters(int index, const std::string& expression, const std::vector<int>& particles,
+                                                const std::vector<std::string>& names,
+                                                const std::vector<double>& values) {
+            $self->setExpressionConstraintParameters(index, expression, particles, makeParameters(names, values));
+        }
+        std::string _getExpression(int index) const {
+            return getConstraintParts($self, index).expression;
+        }
+        std::vector<int> _getExpressionParticles(int index) const {
+            return getConstraintParts($self, index).particles;
+        }
+        std::vector<std::string> _getExpressionParameterNames(int index) const {
+            std::vector<std::string> names;
+            for (const auto& parameter : getConstraintParts($self, index).parameters)
+                names.push_back(parameter.first);
+            return names;
+        }
+        std::vector<double> _getExpressionParameterValues(int index) const {
+            std::vector<double> values;
+            for (const auto& parameter : getConstraintParts($self, index).parameters)
+                values.push_back(parameter.second);
+            return values;
+        }
         %pythoncode %{
+            def addConstraint(
+                self,
+                expression: str,
+                particles: Iterable[int],
+                parameters: Mapping[str, float | unit.Quantity] = {},
+            ) -> int:
+                r"""
+                Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm,
+                which are called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters of
+                this constraint, which have names. It has the syntax of OpenMM's custom forces: operators + - * / ^, their
+                functions, and intermediate values defined after a semicolon. Derivatives are found symbolically. Constraints
+                that have the same expression, with different particles and values of parameters, are evaluated together,
+                which is much faster.
+
+                    integrator.addConstraint("r - r0; r = sqrt((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2)", [3, 7], {"r0": 0.3})
+
+                Functions for the constraints that are asked for most are in openmmvrattle.constraints.
+
+                The gradient of g must not vanish where g = 0: a point is kept on a sphere by r - r0 or by r^2 - r0^2, but
+                not by (r - r0)^2. Coordinates are taken as they are, not as their nearest periodic images. A particle of
+                mass zero is a fixed point; at least one of the particles must have mass, and none may be a virtual site.
+
+                As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at
+                the first step. OpenMM itself knows nothing of it: Context.applyConstraints() and
+                applyVelocityConstraints() leave it alone, and a CompoundIntegrator's other integrators do not keep it. It
+                works on the platforms Reference and CPU.
+
+                A constraint that is added after the Context was created takes effect with Context.reinitialize(); until
+                then steps raise an exception.
+
+                Parameters
+                ----------
+                expression : str
+                    the expression g
+                particles : list
+                    the indices of the particles
+                parameters : dict
+                    the values of the parameters by name, in OpenMM's units (nm, ps, amu, kJ/mol, radian) where they are numbers
+
+                Returns
+                -------
+                int
+                    the index of the constraint among those that were added
+
+                Raises
+                ------
+                OpenMMException
+                    if the expression cannot be understood, contains anything but coordinates of the particles and the
+                    parameters, or a particle is named twice
+                """
+                return _vrattle.VariableStepRattleIntegrator__addConstraint(
+                    self, *_constraint_arguments(expression, particles, parameters)
+                )
+
+            def getExpressionConstraintParameters(self, index: int) -> tuple[str, list[int], dict[str, float]]:
+                r"""
+                Get what a constraint was added with.
+
+                Parameters
+                ----------
+                index : int
+                    the index of the constraint
+
+                Returns
+                -------
+                tuple
+                    the expression, the list of the particles, and the dict of the parameters, as numbers in OpenMM's units
+
+                Raises
+                ------
+                OpenMMException
+                    if there is no constraint with this index
+                """
+                index = _integer(index, "index")
+                names = _vrattle.VariableStepRattleIntegrator__getExpressionParameterNames(self, index)
+                values = _vrattle.VariableStepRattleIntegrator__getExpressionParameterValues(self, index)
+                return (
+                    _vrattle.VariableStepRattleIntegrator__getExpression(self, index),
+                    list(_vrattle.VariableStepRattleIntegrator__getExpressionParticles(self, index)),
+                    dict(zip(names, values)),
+                )
+
+            def setExpressionConstraintParameters(
+                self,
+                index: int,
+                expression: str,
+                particles: Iterable[int],
+                parameters: Mapping[str, float | unit.Quantity] = {},
+            ) -> None:
+                r"""
+                Change a constraint. New values of its parameters are in force at the next step, which starts the run afresh
+                from positions that satisfy the constraint; another expression, other particles or other names take effect
+                with Context.reinitialize(), as for addConstraint().
+
+                Parameters
+                ----------
+                index : int
+                    the index of the constraint
+                expression : str
+                    the expression
+                particles : list
+                    the indices of the particles
+                parameters : dict
+                    the values of the parameters by name
+
+                Raises
+                ------
+                OpenMMException
+                    if there is no constraint with this index, or addConstraint() would refuse it
+                """
+                _vrattle.VariableStepRattleIntegrator__setExpressionConstraintParameters(
+                    self, _integer(index, "index"), *_constraint_arguments(expression, particles, parameters)
+                )
+
             @staticmethod
             def isinstance(integrator: openmm.Integrator) -> bool:
                 r"""

@@ -290,7 +290,7 @@ int ExpressionGraph::partialDerivative(int node, size_t argument) {
         names[ARGUMENT_NAMES[i]] = a[i];
     }
     const Lepton::ParsedExpression expression(ExpressionTreeNode(n.operation->clone(), children));
-    return addTree(expression.differentiate(ARGUMENT_NAMES[argument]).optimize().getRootNode(), names);
+    return addTree(expression.differentiate(ARGUMENT_NAMES[argument]).getRootNode(), names);
 }
 
 int ExpressionGraph::differentiate(int node, const vector<std::pair<int, int>>& rates) {

@@ -28,8 +28,8 @@ ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParti
         parameterNames.push_back(parameter.first);
         parameters.push_back(graph.addVariable(parameter.first));
     }
-    const Lepton::ParsedExpression expression = Lepton::Parser::parse(example.expression).optimize();
-    value = graph.addExpression(expression.getRootNode());
+    // Not optimized by Lepton, which for a constant that is not a number would go on for ever; the graph does it.
+    value = graph.addExpression(Lepton::Parser::parse(example.expression).getRootNode());
     // These names can not be written in an expression.
     vector<std::pair<int, int>> rates;
     for (int i = 0; i < 3 * numParticles; i++) {

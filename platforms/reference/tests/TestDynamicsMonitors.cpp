@@ -83,8 +83,10 @@ public:
     vector<double> applied, multipliers, rightSide, values;
 };
 
-static void checkGradient(const vector<StepMonitor::Term>& terms, double order) {
+static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
+                          const vector<ExpressionConstraint>& expressions = {}) {
     Example e;
+    e.expressions = expressions;
     Evaluation evaluation(e, terms, order);
     vector<Vec3> gradient = evaluation.gradient(e.velocities);
     double largest = 0;
@@ -112,6 +114,14 @@ void testGradients() {
         for (double power : {1.0, 0.5, 2.0})
             checkGradient({{(StepMonitor::Kind) kind, 1.0, power, 700.0}}, 8);
     checkGradient({{StepMonitor::MultiplierPNorm, 1.0, 1.0, 1e4}}, 3);
+}
+
+// G(v) of an expression depends on the positions, unlike that of a distance.
+void testGradientsWithExpressions() {
+    const vector<ExpressionConstraint> expressions = {{"sin(3*x1)*y2+z1*z2^2-d", {5, 0}, {{"d", 0.2}}},
+                                                      {"exp(x1)*sqrt(1+y1^2)-z1", {4}, {}}};
+    for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
+        checkGradient({{(StepMonitor::Kind) kind, 1.0, 0.5, 700.0}}, 8, expressions);
 }
 
 void testCombinationGradient() {
@@ -204,6 +214,7 @@ void testRecursions() {
 int main() {
     return runTests({
         {"du/dv of every monitor against differences", testGradients},
+        {"du/dv with expressions among the constraints", testGradientsWithExpressions},
         {"du/dv of a combination against differences", testCombinationGradient},
         {"the combination is normalised term by term", testCombination},
         {"multipliers that are rounding are noticed", testNegligibleMultipliers},
