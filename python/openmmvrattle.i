@@ -856,7 +856,7 @@ def setExpressionConstraintParameter(self, index: int, name: str, value: float |
     name : str
         the name of the parameter
     value : float or Quantity
-        its new value, in OpenMM's units (nm, ps, amu, kJ/mol, radian) if it is a number
+        its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
 
     Raises
     ------
@@ -1121,7 +1121,7 @@ public:
                 particles : list
                     the indices of the particles
                 parameters : dict
-                    the values of the parameters by name, in OpenMM's units (nm, ps, amu, kJ/mol, radian) where they are numbers
+                    the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
 
                 Returns
                 -------
@@ -1187,7 +1187,7 @@ public:
                 particles : list
                     the indices of the particles
                 parameters : dict
-                    the values of the parameters by name
+                    the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
 
                 Raises
                 ------
