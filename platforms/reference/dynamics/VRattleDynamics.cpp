@@ -49,10 +49,10 @@ double dot(const vector<double>& a, const vector<double>& b) {
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                  const vector<ExpressionConstraint>& expressions) :
-        system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system), automatic(system),
-        settings(), groupEnergy(0), rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0),
-        densityOffset(0), firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1),
-        stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
+        system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
+        automatic(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false), hasHalfStepValue(false),
+        halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false),
+        stepKind(First), rhoNext(1), stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
