@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.metadata
 import multiprocessing
 import os
+import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
@@ -186,6 +187,10 @@ def _died(case: Case, index: int, code: int | None) -> IntegratorRun:
     return failed_run(case.methods()[index], f"its process ended {reason}")
 
 
+def _run_pickled(case: bytes, index: int) -> IntegratorRun:
+    return run_case(pickle.loads(case), index)
+
+
 class DaskRunner:
     """Runs on the workers of a Dask cluster, on which this package must be installed too."""
 
@@ -229,13 +234,14 @@ class DaskRunner:
         """See `Runner`."""
         from distributed import as_completed
 
-        sent = {index: self._client.scatter(cases[index], hash=False) for index in {case for case, _ in works}}
+        # As bytes, which only the process that runs them unpacks: what cannot be unpacked there is a failed run.
+        sent = {index: pickle.dumps(cases[index]) for index in {case for case, _ in works}}
         futures = {}
         for index, method in works:
             key = f"vrattle-{os.getpid()}-{index}-{method}"
-            futures[self._client.submit(run_case, sent[index], method, pure=False, key=key)] = (index, method)
+            futures[self._client.submit(_run_pickled, sent[index], method, pure=False, key=key)] = (index, method)
         try:
-            for future in as_completed(futures):
+            for future in as_completed(futures, loop=self._client.loop):
                 index, method = work = futures[future]
                 if future.status == "finished":
                     yield work, future.result()

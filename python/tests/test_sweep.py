@@ -1,0 +1,423 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""Many comparisons at once: equal accuracy, processes, a Dask cluster, interrupts, and the folder of results."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import openmm
+import pytest
+from openmmvrattle.comparison import Case, compare, verdict
+from openmmvrattle.measurement import (
+    ACCURACY_TOLERANCE,
+    INTEGRATORS,
+    make_integrator,
+    methods_of,
+    run_method,
+    run_to_accuracy,
+)
+from openmmvrattle.results import ResultFolder, mean_gains
+from openmmvrattle.sweep import DaskRunner, ProcessRunner, RunnerError, SerialRunner, run_sweep
+from openmmvrattle.testsystems import (
+    ComparisonSettings,
+    MonitorSettings,
+    StepControl,
+    light_heavy_chain,
+    rigid_waters,
+    water_clash,
+)
+
+
+def small_case(label="clash", **changes):
+    clash = water_clash()
+    return Case(clash, replace(clash.settings, total_time=0.05, force_evaluations=200), label=label, **changes)
+
+
+def run_command(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=300, **options
+    )
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "summary.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ------------------------------------------------------------------------------------------------ integrators by name
+
+
+def test_integrators_are_chosen_by_name():
+    settings = water_clash().settings
+    assert [m.method for m in methods_of(settings)] == ["fixed", "variable", "control", "vrattle"]
+    assert [m.method for m in methods_of(settings, ["VRATTLE", "RATTLE"])] == ["vrattle", "control"]
+    assert set(INTEGRATORS) >= {"VerletIntegrator", "VariableVerletIntegrator", "RATTLE", "VRATTLE"}
+
+
+def test_runs_have_names_of_their_own():
+    one = StepControl((MonitorSettings("ForcePNorm"),), 1e-3)
+    controls = (
+        one,
+        replace(one, update_method="Explicit"),
+        replace(one, largest_step_ratio=4.0),
+        replace(one, calibration_steps=10),
+        StepControl((MonitorSettings("MaxForce"),), 1e-3),
+    )
+    settings = ComparisonSettings(1.0, 100, controls)
+    names = [method.name for method in methods_of(settings)]
+    assert len(set(names)) == len(names) == 8
+    assert names[-1] == "VRATTLE, MaxForce"
+    assert "VRATTLE, ForcePNorm, Explicit" in names
+
+
+def test_reference_values_are_set():
+    control = StepControl((MonitorSettings("ForcePNorm"),), 1e-3, reference_values=(123.0,))
+    assert make_integrator(control).getReferenceMonitorValue(0) == 123.0
+
+
+# ------------------------------------------------------------------------------------------------------ equal accuracy
+
+
+def test_equal_accuracy():
+    """The number that is found is enough, a few per cent less are not, and it grows with the root of the accuracy."""
+    chain = light_heavy_chain()
+    settings = replace(chain.settings, force_evaluations=4000)
+    numbers = []
+    for wanted in (4e-3, 1e-3):
+        method = methods_of(settings, ["RATTLE"])[0]
+        run = run_to_accuracy(method, chain, "Reference", settings, wanted)
+        assert run.failure is None
+        assert 0.8 * wanted < run.largest_energy_error <= wanted
+        fewer = replace(settings, force_evaluations=round(run.force_evaluations * (1 - 2 * ACCURACY_TOLERANCE)))
+        poorer = run_method(methods_of(fewer, ["RATTLE"])[0], chain, "Reference", fewer)
+        assert poorer.largest_energy_error > wanted
+        numbers.append(run.force_evaluations)
+    assert numbers[1] / numbers[0] == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["VariableVerletIntegrator", "VRATTLE"])
+def test_equal_accuracy_of_variable_steps(name):
+    clash = water_clash()
+    method = methods_of(clash.settings, [name])[0]
+    run = run_to_accuracy(method, clash, "Reference", clash.settings, 10.0)
+    assert run.failure is None
+    assert 1.0 < run.largest_energy_error <= 10.0
+
+
+def test_accuracy_that_is_too_much_to_ask():
+    clash = water_clash()
+    method = methods_of(clash.settings, ["RATTLE"])[0]
+    run = run_to_accuracy(method, clash, "Reference", clash.settings, 1e-9, most_evaluations=3000)
+    assert re.match(
+        r"it needs more than 3,000 force evaluations; with [23],?\d+ its largest energy error is", run.failure
+    )
+
+
+def test_comparison_at_equal_accuracy():
+    chain = light_heavy_chain()
+    settings = replace(chain.settings, total_time=20.0, force_evaluations=4000)
+    result = compare(chain, settings=settings, integrators=["RATTLE", "VRATTLE"], wanted_error=1e-2)
+    fixed, variable = result.runs
+    assert result.saving(variable) == fixed.force_evaluations / variable.force_evaluations > 5
+    assert result.best() is variable
+    sentences = " ".join(verdict(result))
+    assert "Fewest force evaluations for an energy error of 0.01 kJ/mol: VRATTLE" in sentences
+    assert "their force evaluations divided by its own" in sentences
+
+
+# ----------------------------------------------------------------------------------------------- several processes
+
+
+def numbers_of(comparisons):
+    return [
+        (c.label, run.name, run.largest_energy_error, run.steps, run.failure) for c in comparisons for run in c.runs
+    ]
+
+
+def test_processes_give_the_same_results():
+    cases = [small_case("one"), small_case("two", integrators=("RATTLE", "VRATTLE"), seed=3)]
+    order = []
+    serial, interrupted = run_sweep(cases, SerialRunner())
+    assert not interrupted
+    parallel, interrupted = run_sweep(cases, ProcessRunner(2), finished=lambda index, comparison: order.append(index))
+    assert not interrupted
+    assert numbers_of(parallel) == numbers_of(serial)
+    assert sorted(order) == [0, 1]
+    assert [len(c.runs) for c in parallel] == [4, 2]
+    for one, other in zip(parallel[0].runs, serial[0].runs, strict=True):
+        assert np.array_equal(one.series.energy_errors, other.series.energy_errors)
+
+
+class _EndsTheProcess:
+    """Ends the process that unpickles it, as a crash does."""
+
+    def __reduce__(self):
+        return exec, ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)",)
+
+
+def test_a_process_that_dies_is_a_failed_run():
+    good, bad = small_case("good", integrators=("RATTLE",)), small_case("bad", integrators=("RATTLE",))
+    bad = replace(bad, test_system=replace(bad.test_system, topology=_EndsTheProcess()))
+    results, _ = run_sweep([bad, good], ProcessRunner(2))
+    assert results[0].runs[0].failure == "its process ended by signal SIGKILL"
+    assert results[1].runs[0].failure is None
+
+
+def test_an_integrator_that_cannot_be_made_is_a_failed_run():
+    case = small_case()
+    broken = StepControl((MonitorSettings("NoSuchMonitor"),), 1e-3)
+    case = replace(case, settings=replace(case.settings, controls=(broken,)), wanted_error=10.0)
+    results, _ = run_sweep([case], SerialRunner())
+    assert "NoSuchMonitor" in results[0].runs[-1].failure
+    assert results[0].runs[2].failure is None
+
+
+def test_progress_is_told_from_other_processes():
+    seen = []
+    run_sweep([small_case(integrators=("RATTLE",))], ProcessRunner(1), lambda *report: seen.append(report))
+    assert seen[0] == ((0, 0), "starting", 0.0)
+    assert ((0, 0), "done", 1.0) in seen
+    assert any(activity == "running" for _, activity, _ in seen)
+
+
+# ------------------------------------------------------------------------------------------------------ a Dask cluster
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as local_cluster:
+        yield local_cluster
+
+
+def test_a_cluster_gives_the_same_results(cluster):
+    cases = [small_case("one"), small_case("two", integrators=("RATTLE",))]
+    serial, _ = run_sweep(cases, SerialRunner())
+    runner = DaskRunner(cluster.scheduler_address)
+    assert runner.workers == 2
+    distributed_ones, interrupted = run_sweep(cases, runner)
+    assert not interrupted
+    assert numbers_of(distributed_ones) == numbers_of(serial)
+
+
+def test_a_worker_that_dies_is_a_failed_run(cluster):
+    """Dask tries again on other workers, and gives up."""
+    good, bad = small_case("good", integrators=("RATTLE",)), small_case("bad", integrators=("RATTLE",))
+    bad = replace(bad, test_system=replace(bad.test_system, topology=_EndsTheProcess()))
+    results, _ = run_sweep([bad, good], DaskRunner(cluster.scheduler_address))
+    assert "died" in results[0].runs[0].failure
+    assert results[1].runs[0].failure is None
+
+
+def test_the_command_line_on_a_cluster(cluster, tmp_path):
+    result = run_command(
+        *("compare", "--system", "water-clash", "--time", "0.05", "--seeds", "1", "2"),
+        *("--integrators", "RATTLE", "VRATTLE", "--scheduler", cluster.scheduler_address, "--output", str(tmp_path)),
+    )
+    assert result.returncode == 0, result.stderr
+    assert "2 worker(s)" in result.stdout
+    assert [row["name"] for row in rows_of(tmp_path)] == ["RATTLE, fixed steps", "VRATTLE, ForcePNorm^0.5"]
+
+
+def test_no_scheduler():
+    pytest.importorskip("distributed")
+    with pytest.raises(RunnerError, match="there is no Dask scheduler at tcp://127.0.0.1:9"):
+        DaskRunner("tcp://127.0.0.1:9", timeout=1)
+
+
+def test_dask_that_is_not_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(RunnerError, match=re.escape("pip install openmm-vrattle[dask]")):
+        DaskRunner("tcp://127.0.0.1:9")
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"), [("0.0.1", "has openmm-vrattle 0.0.1, but this"), (ImportError(), "has no openmm-vrattle")]
+)
+def test_workers_with_other_versions_are_refused(answer, words):
+    class Client:
+        def run(self, function, package, on_error):
+            return {"tcp://worker": answer}
+
+    runner = DaskRunner.__new__(DaskRunner)
+    runner._client = Client()
+    with pytest.raises(RunnerError, match=words):
+        runner._check_versions()
+
+
+# ------------------------------------------------------------------------------------------------------ interrupts
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals of POSIX")
+@pytest.mark.parametrize("whom", ["the command alone", "all processes, as Ctrl-C does"])
+def test_interrupt_of_several_processes(tmp_path, whom):
+    """What was finished stays, no process is left behind, and nothing but words is shown."""
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "openmmvrattle", "compare", "--output", str(tmp_path), "--jobs", "2"),
+            *("--system", "water-clash", "double-pendulum", "--evaluations", "3000000"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # A background job of a shell is started with interrupts ignored, and so would be the command.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        time.sleep(6.0)
+        if whom == "the command alone":
+            process.send_signal(signal.SIGINT)
+        else:
+            os.killpg(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+        assert process.returncode == 130, errors
+        assert "Interrupted" in output
+        assert "Traceback" not in errors
+        deadline = time.monotonic() + 20
+        while _group_lives(process.pid):
+            assert time.monotonic() < deadline, "a process was left behind"
+            time.sleep(0.1)
+    finally:
+        if _group_lives(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def _group_lives(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_interrupt_keeps_the_runs_that_were_done(tmp_path):
+    """Of two cases the first is finished, the second has one run, and a third none."""
+    cases = [small_case(label, integrators=("RATTLE", "VRATTLE")) for label in ("first", "second", "third")]
+    folder = ResultFolder(tmp_path)
+
+    def interrupt(work, activity, fraction):
+        if work == (1, 1):
+            raise KeyboardInterrupt
+
+    results, interrupted = run_sweep(cases, SerialRunner(), interrupt, folder.add)
+    assert interrupted
+    assert [(c.label, len(c.runs), c.interrupted) for c in results] == [("first", 2, False), ("second", 1, True)]
+    assert len(rows_of(tmp_path)) == 3
+    assert "The comparison was interrupted" in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "second.json").read_text())["interrupted"] is True
+
+
+# ------------------------------------------------------------------------------------------------------ results
+
+
+@pytest.fixture(scope="module")
+def clash_result():
+    return run_sweep([small_case()], SerialRunner())[0][0]
+
+
+def test_folder_of_results(tmp_path, clash_result):
+    folder = ResultFolder(tmp_path / "deep" / "folder", command="python -m openmmvrattle compare <here>")
+    folder.add(0, clash_result)
+    folder.add(1, replace(clash_result, label="<b>& again", seed=2))
+    index = json.loads((folder.path / "comparison.json").read_text())
+    assert all((folder.path / file).exists() for file in index["files"])
+    report = (folder.path / "report.html").read_text()
+    assert report.count("data:image/png;base64,") == 2
+    assert "&lt;here&gt;" in report and "<here>" not in report
+    assert "&lt;b&gt;&amp; again" in report and "<b>&" not in report
+    for run in clash_result.runs:
+        assert run.name in report
+    assert "Gains over RATTLE with fixed steps" in report
+    assert [row["seed"] for row in rows_of(folder.path)] == [""] * 4 + ["2"] * 4
+
+
+def test_earlier_results_are_moved_aside(tmp_path, clash_result):
+    """And nothing else that lies in the folder."""
+    (tmp_path / "mine.csv").write_text("mine")
+    ResultFolder(tmp_path).add(0, clash_result)
+    first = (tmp_path / "clash.json").read_text()
+    again = ResultFolder(tmp_path)
+    assert again.moved_to == tmp_path / "earlier-1"
+    assert (tmp_path / "earlier-1" / "clash.json").read_text() == first
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["earlier-1", "mine.csv"]
+    again.add(0, clash_result)
+    assert ResultFolder(tmp_path).moved_to == tmp_path / "earlier-2"
+
+
+def test_earlier_results_can_be_replaced(tmp_path, clash_result):
+    ResultFolder(tmp_path).add(0, clash_result)
+    again = ResultFolder(tmp_path, overwrite=True)
+    assert again.moved_to is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_mean_gains(clash_result):
+    """The geometric mean over the starts; failed ones are counted and left out."""
+    control = next(run for run in clash_result.runs if run.method == "control")
+    variable = next(run for run in clash_result.runs if run.method == "vrattle")
+    starts = []
+    for gain in (2.0, 8.0, None):
+        run = replace(variable, largest_energy_error=control.largest_energy_error / (gain or 1.0))
+        starts.append(replace(clash_result, runs=(control, replace(run, failure=None if gain else "it failed"))))
+    (row,) = mean_gains(starts)
+    assert (row.starts, row.failures) == (3, 1)
+    assert row.mean == pytest.approx(4.0)
+    assert (row.smallest, row.largest) == (pytest.approx(2.0), pytest.approx(8.0))
+    saved = [replace(start, wanted_error=1.0) for start in starts]
+    assert mean_gains(saved)[0].mean == pytest.approx(control.force_evaluations / variable.force_evaluations)
+
+
+def test_a_sweep_over_systems_starts_and_steps(tmp_path):
+    result = run_command(
+        *("compare", "--system", "rigid-waters", "water-clash", "--seeds", "1", "2", "--evaluations", "100", "200"),
+        *("--time", "0.1", "--integrators", "rattle", "vrattle", "--monitors", "ForcePNorm^0.5"),
+        *("--updates", "Explicit", "Bounded", "--jobs", "2", "--output", str(tmp_path)),
+    )
+    assert result.returncode == 0, result.stderr
+    rows = rows_of(tmp_path)
+    assert {(row["system"], row["seed"], row["evaluations_asked_for"]) for row in rows} == {
+        *(("rigid-waters", seed, number) for seed in "12" for number in ("100", "200")),
+        *(("water-clash", "", number) for number in ("100", "200")),
+    }
+    assert len(rows) == 6 * 3
+    energies = {row["largest_energy_error"] for row in rows if row["system"] == "rigid-waters"}
+    assert len(energies) == 12  # each start is another one
+    assert "geometric mean over the starts" in result.stdout
+    assert (tmp_path / "rigid-waters-seed-2-200.png").exists()
+
+
+def test_all_systems_are_known_by_one_name():
+    from openmmvrattle.__main__ import _parser
+    from openmmvrattle.commands import compare as command
+    from openmmvrattle.testsystems import SYSTEMS
+
+    options = _parser().parse_args(["compare", "--system", "all"])
+    command._check(options)
+    assert options.system == list(SYSTEMS)
+
+
+def test_failure_to_compute_the_first_energy():
+    """A System that cannot be run at all gives rows with the reason and no energy."""
+    waters = rigid_waters(1)
+    force = openmm.CustomExternalForce("no_such_parameter*x")
+    force.addParticle(0, [])
+    waters.system.addForce(force)
+    (result,), _ = run_sweep([Case(waters, waters.settings)], SerialRunner())
+    assert all("no_such_parameter" in run.failure for run in result.runs)
+    assert math.isnan(result.initial_energy)
+    assert verdict(result)[0] == "No integrator reached the end."
