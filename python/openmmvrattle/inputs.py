@@ -238,6 +238,9 @@ def _started(
     integrator.setRandomNumberSeed(seed)
     integrator.setConstraintTolerance(1e-8)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+    # Those of Forces that were left out are of no use any more.
+    known = set(context.getParameters())
+    start = replace(start, parameters=tuple(pair for pair in start.parameters if pair[0] in known))
     for name, value in start.parameters:
         context.setParameter(name, value)
     context.setPositions(start.positions)

@@ -86,8 +86,10 @@ def chosen(name: str, names: Iterable[str], what: str) -> str:
         if candidate.lower() == name.lower():
             return candidate
     near = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=3)
+    if len(name) > 3:
+        near += [n.lower() for n in names if name.lower() in n.lower()]
     suggestions = [n for n in names if n.lower() in near]
-    if suggestions:
+    if 0 < len(suggestions) <= 5:
         raise UsageError(f"there is no {what} '{name}'; did you mean {' or '.join(suggestions)}?")
     raise UsageError(f"there is no {what} '{name}'; choose among {', '.join(names)}.")
 
