@@ -42,7 +42,9 @@ def copies_of(problem: problems.Problem, count: int) -> tuple[np.ndarray, np.nda
     copies = max(1, round(count / len(pairs)))
     offsets = len(masses) * np.arange(copies)
     edge = int(np.ceil(copies ** (1 / 3)))
-    places = np.stack([np.arange(copies) % edge, np.arange(copies) // edge % edge, np.arange(copies) // edge**2], axis=1)
+    places = np.stack(
+        [np.arange(copies) % edge, np.arange(copies) // edge % edge, np.arange(copies) // edge**2], axis=1
+    )
     return (
         np.tile(masses, copies),
         (pairs[None] + offsets[:, None, None]).reshape(-1, 2),
@@ -143,7 +145,9 @@ def main() -> None:
             "openmm_context_seconds": theirs,
         }
         print(json.dumps(result))
-        print(f"A chain of {arguments.context} bonds: ours {ours['setup_seconds']:.2f} s, OpenMM's Context {theirs:.1f} s")
+        print(
+            f"A chain of {arguments.context} bonds: ours {ours['setup_seconds']:.2f} s, OpenMM's Context {theirs:.1f} s"
+        )
 
 
 if __name__ == "__main__":

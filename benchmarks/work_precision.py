@@ -63,6 +63,8 @@ that the user writes for one system, and these systems have no natural one."""
 UPDATES = ("SemiExplicit", "Explicit", "Bounded")
 DEFAULT_BOUNDS = (1 / 50, 2.0)
 """Smallest and largest step divided by the nominal one, as the integrator has them by default."""
+INTEGRATORS = ("VerletIntegrator", "VariableVerletIntegrator", "RATTLE", "VRATTLE")
+"""What is run: OpenMM's own, the control, and the step controls."""
 QUICK_PART, QUICK_EVALUATIONS = 0.05, 100
 """With --quick: the part of each run that is kept, and the fewest evaluations that are left then."""
 
@@ -458,7 +460,7 @@ def _run(task: Task) -> list[Measurement]:
             for control, steps in zip(task.controls, calibrations, strict=True)
         )
         settings = replace(quick_settings(settings, task.part, fewest=1), controls=controls)
-    comparison = compare(test_system, settings=settings)
+    comparison = compare(test_system, settings=settings, integrators=INTEGRATORS)
     measurements = []
     for index, run in enumerate(comparison.runs):
         # The first three runs are Verlet, VariableVerlet and RATTLE with fixed steps.

@@ -204,12 +204,15 @@ class Advice:
                 f"Use variable steps: {what}. {gain} in the largest energy error, or the same error with about "
                 f"{two_digits(saved)} times fewer force evaluations."
             )
+            lines.append("Or without any settings: useAutomaticStepControl(), which mostly gains somewhat less.")
         elif self.verdict == "little to gain":
             lines.append(f"Use fixed steps: there is little to gain. The best was {what}: {gain}.")
+            lines.append("useAutomaticStepControl() does no harm, and takes its chance.")
         else:
             lines.append(
                 f"Use fixed steps: nothing promises a gain. The largest P is {two_digits(self.largest_predictor)}."
             )
+            lines.append("useAutomaticStepControl() would hardly ever leave them here, and costs its calibration.")
         return lines
 
     @property
@@ -486,35 +489,35 @@ def _run_trial(
 
 
 def measured_gain(
-    advice: Advice, start: TestSystem, platform: str = "Reference", candidate: Candidate | None = None
+    advice: Advice, start: TestSystem, platform: str = "Reference", automatic: bool = False
 ) -> tuple[float, str | None]:
-    """Check an advice: run fixed steps and a candidate, both with as many force evaluations as the trial had.
+    """Check an advice: run fixed and variable steps, both with as many force evaluations as the trial had.
 
     Args:
         advice: what to check.
         start: the system that it is about.
         platform: name of the OpenMM platform.
-        candidate: by default the best one of the advice.
+        automatic: whether to run the automatic step control, and not the best candidate of the advice.
 
     Returns:
-        The largest energy error of fixed steps divided by that of the candidate, and None; or NaN and why it failed.
-        Infinity, where fixed steps fail and the candidate does not.
+        The largest energy error of fixed steps divided by that of variable ones, and None; or NaN and why they failed.
+        Infinity, where fixed steps fail and variable ones do not.
     """
     from .measurement import methods_of, run_method
 
-    chosen = candidate or advice.best
-    if chosen is None:
+    if advice.best is None:
         return 1.0, None
     steps = len(advice.trial.times) - 1
     settings = replace(
         start.settings,
         total_time=float(advice.trial.times[-1]),
         force_evaluations=steps,
-        controls=(chosen.control,),
+        controls=(advice.best.control,),
         constraint_tolerance=advice.constraint_tolerance,
     )
     fixed, variable = (
-        run_method(method, start, platform, settings) for method in methods_of(settings, ("RATTLE", "VRATTLE"))
+        run_method(method, start, platform, settings)
+        for method in methods_of(settings, ("RATTLE", "Automatic" if automatic else "VRATTLE"))
     )
     if variable.failure is not None:
         return math.nan, variable.failure

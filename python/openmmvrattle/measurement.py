@@ -119,6 +119,8 @@ class Method:
     """Whether the first guess gives the wanted number of steps, as a fixed step does."""
     calibration_steps: int = 0
     """Trial steps before the run, which count as force evaluations."""
+    automatic_trial_steps: int = 0
+    """Trial steps that the integrator takes by itself at the first step, which count as well."""
     update_method: str | None = None
     """The recursion of the step density, where there is one."""
 
@@ -135,6 +137,13 @@ def _rattle(settings: ComparisonSettings) -> list[Method]:
     control = StepControl(monitors=(), nominal_step_size=_mean_step(settings))
     make = functools.partial(make_integrator, control)
     return [Method(control.label, "control", make, control.nominal_step_size, -1.0, is_exact=True)]
+
+
+def _automatic(settings: ComparisonSettings) -> list[Method]:
+    steps = max(10, min(300, settings.force_evaluations // 16))
+    control = StepControl(monitors=(), nominal_step_size=_mean_step(settings), automatic_trial_steps=steps)
+    make = functools.partial(make_integrator, control)
+    return [Method(control.label, "vrattle", make, control.nominal_step_size, -1.0, automatic_trial_steps=steps)]
 
 
 def _vrattle(settings: ComparisonSettings) -> list[Method]:
@@ -158,9 +167,11 @@ INTEGRATORS: dict[str, Callable[[ComparisonSettings], list[Method]]] = {
     "VariableVerletIntegrator": _variable_verlet,
     "RATTLE": _rattle,
     "VRATTLE": _vrattle,
+    "Automatic": _automatic,
 }
 """What can be compared, by name; each value gives the methods to run for the settings. ``RATTLE`` is our integrator
-without a monitor, which has fixed steps; ``VRATTLE`` is the same with each of the step controls of the settings."""
+without a monitor, which has fixed steps; ``VRATTLE`` is the same with each of the step controls of the settings, and
+``Automatic`` with the automatic step control."""
 
 
 def methods_of(settings: ComparisonSettings, integrators: Iterable[str] | None = None) -> list[Method]:
@@ -202,6 +213,9 @@ def make_integrator(control: StepControl, nominal_step_size: float | None = None
     """
     nominal = control.nominal_step_size if nominal_step_size is None else nominal_step_size
     integrator = VariableStepRattleIntegrator(nominal)
+    if control.automatic_trial_steps:
+        integrator.useAutomaticStepControl(control.automatic_trial_steps)
+        return integrator
     integrator.clearMonitors()
     for monitor in control.monitors:
         integrator.addMonitor(getattr(VariableStepRattleIntegrator, monitor.kind), monitor.weight, monitor.power)
@@ -403,7 +417,7 @@ def _count_steps(
         steps += 1
     del context
     needed = steps if simulated >= _end_of(settings) else steps * settings.total_time / simulated
-    return needed + method.calibration_steps
+    return needed + method.calibration_steps + method.automatic_trial_steps
 
 
 def _measure(

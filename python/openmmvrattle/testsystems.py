@@ -75,10 +75,14 @@ class StepControl:
     """Trial steps from which the reference value is taken (``calibrate``); 0 for the value at the first step."""
     reference_values: tuple[float, ...] = ()
     """Reference values of the monitors, in their units, if they are known beforehand."""
+    automatic_trial_steps: int = 0
+    """Trial steps of the automatic step control, which takes the place of monitors, bounds and update; 0 for none."""
 
     @property
     def label(self) -> str:
         """A short name for tables and pictures."""
+        if self.automatic_trial_steps:
+            return "VRATTLE, automatic"
         if not self.monitors:
             return "RATTLE, fixed steps"
         names = (m.kind if m.power == 1.0 else f"{m.kind}^{m.power:g}" for m in self.monitors)

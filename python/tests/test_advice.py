@@ -66,6 +66,24 @@ def test_the_verdict_is_what_is_measured(name, evaluations, verdict, lowest, hig
         assert not advice.resolved or 0.25 < gain / advice.best.expected_gain < 4
 
 
+@pytest.mark.parametrize("name", ["alanine-dipeptide-hbonds", "rigid-waters"])
+def test_automatic_step_control_does_nothing_where_nothing_pays(name):
+    """Its steps are those of fixed steps to 1 %, but for those of its calibration."""
+    start = SYSTEMS[name]()
+    (method,) = methods_of(start.settings, ("Automatic",))
+    run = run_method(method, start, "Reference", start.settings)
+    assert run.failure is None
+    assert run.force_evaluations == pytest.approx(start.settings.force_evaluations, rel=0.02)
+    assert run.largest_step / run.smallest_step < 1.01
+
+
+def test_automatic_step_control_pays_where_something_does():
+    advice, start = advice_on("light-heavy-chain")
+    gain, failure = measured_gain(advice, start, automatic=True)
+    assert failure is None
+    assert gain > 100
+
+
 def test_the_trial_is_the_run_with_fixed_steps():
     """The monitors do not change the steps: the energies are those of the integrator without a monitor."""
     start = rigid_waters(4)

@@ -316,10 +316,12 @@ def test_advise_on_a_molecule_of_the_user(pdb: Path, tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "Use fixed steps: nothing promises a gain." in result.stdout
     assert "1,000 fixed steps of 0.001 ps" in result.stdout
-    assert "Measured over this trial, at equal force evaluations: a gain of" in result.stdout
+    assert "- the best settings: a gain of" in result.stdout
+    assert "- automatic step control: a gain of" in result.stdout
     content = json.loads((tmp_path / "advice" / "advice.json").read_text())
     assert content["verdict"] == "fixed steps"
-    assert 0.1 < content["measured_gain"] < 1.25
+    assert set(content["measured_gains"]) == {"the best settings", "automatic step control"}
+    assert all(0.1 < gain < 1.25 for gain in content["measured_gains"].values())
     assert max(candidate["predictor"] for candidate in content["candidates"]) < 2.2
     lines = (tmp_path / "advice" / "trial.csv").read_text().splitlines()
     assert len(lines) == 1002

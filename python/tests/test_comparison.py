@@ -36,7 +36,7 @@ from openmmvrattle.comparison import (
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, StepControl
 from rich.console import Console
 
-METHODS = ["fixed", "variable", "control", "vrattle"]
+METHODS = ["fixed", "variable", "control", "vrattle", "vrattle"]
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +85,16 @@ def make_comparison(*runs, **changes):
 
 def test_all_integrators_run(pendulum):
     assert [run.method for run in pendulum.runs] == METHODS
-    assert [run.failure for run in pendulum.runs] == [None] * 4
+    assert [run.failure for run in pendulum.runs] == [None] * 5
     assert not pendulum.interrupted
 
 
 def test_force_evaluations_are_equal(pendulum):
     for run in pendulum.runs:
         assert run.force_evaluations == pytest.approx(15_000, rel=0.02), run.name
-        assert abs(run.force_evaluations - run.steps) <= 1, run.name
+        # The automatic step control has trial steps before the first step: 300, and three at the start itself.
+        trial_steps = 303 if run.name == "VRATTLE, automatic" else 1
+        assert 0 <= run.force_evaluations - run.steps <= trial_steps, run.name
 
 
 def test_same_time_and_same_start(pendulum):
@@ -158,8 +160,8 @@ def test_exception_of_an_integrator_is_its_failure():
     broken = StepControl(monitors=(MonitorSettings("NoSuchMonitor"),), nominal_step_size=0.001)
     settings = replace(quick_settings(test_system.settings), controls=(broken,))
     result = compare(test_system, settings=settings)
-    assert [run.failure is None for run in result.runs] == [True, True, True, False]
-    assert "NoSuchMonitor" in result.runs[-1].failure
+    assert [run.failure is None for run in result.runs] == [True, True, True, False, True]
+    assert "NoSuchMonitor" in result.runs[3].failure
 
 
 def test_energy_that_is_not_a_number_is_a_failure():
@@ -209,7 +211,7 @@ def test_calibration_counts_as_force_evaluations():
     first_value = test_system.settings.controls[0]
     controls = (first_value, replace(first_value, calibration_steps=200))
     settings = replace(test_system.settings, total_time=2.0, force_evaluations=1600, controls=controls)
-    runs = compare(test_system, settings=settings).runs[-2:]
+    runs = compare(test_system, settings=settings, integrators=["VRATTLE"]).runs
     assert runs[1].steps == pytest.approx(1400, rel=0.03)
     assert runs[0].steps == pytest.approx(1600, rel=0.02)
     assert runs[0].parameter != pytest.approx(runs[1].parameter, rel=0.1)
@@ -223,7 +225,7 @@ def test_progress_reaches_its_end():
     settings = replace(quick_settings(test_system.settings), controls=test_system.settings.controls[:1])
     compare(test_system, settings=settings, progress=lambda *report: reports.append(report))
     names = list(dict.fromkeys(name for name, _, _ in reports))
-    assert len(names) == 4
+    assert len(names) == 5
     assert all((name, "done", 1.0) in reports for name in names)
     assert all(0.0 <= fraction <= 1.0 for _, _, fraction in reports)
 

@@ -61,9 +61,9 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 def test_integrators_are_chosen_by_name():
     settings = water_clash().settings
-    assert [m.method for m in methods_of(settings)] == ["fixed", "variable", "control", "vrattle"]
+    assert [m.method for m in methods_of(settings)] == ["fixed", "variable", "control", "vrattle", "vrattle"]
     assert [m.method for m in methods_of(settings, ["VRATTLE", "RATTLE"])] == ["vrattle", "control"]
-    assert set(INTEGRATORS) >= {"VerletIntegrator", "VariableVerletIntegrator", "RATTLE", "VRATTLE"}
+    assert set(INTEGRATORS) >= {"VerletIntegrator", "VariableVerletIntegrator", "RATTLE", "VRATTLE", "Automatic"}
 
 
 def test_runs_have_names_of_their_own():
@@ -77,8 +77,8 @@ def test_runs_have_names_of_their_own():
     )
     settings = ComparisonSettings(1.0, 100, controls)
     names = [method.name for method in methods_of(settings)]
-    assert len(set(names)) == len(names) == 8
-    assert names[-1] == "VRATTLE, MaxForce"
+    assert len(set(names)) == len(names) == 9
+    assert names[-2:] == ["VRATTLE, MaxForce", "VRATTLE, automatic"]
     assert "VRATTLE, ForcePNorm, Explicit" in names
 
 
@@ -155,7 +155,7 @@ def test_processes_give_the_same_results():
     assert not interrupted
     assert numbers_of(parallel) == numbers_of(serial)
     assert sorted(order) == [0, 1]
-    assert [len(c.runs) for c in parallel] == [4, 2]
+    assert [len(c.runs) for c in parallel] == [5, 2]
     for one, other in zip(parallel[0].runs, serial[0].runs, strict=True):
         assert np.array_equal(one.series.energy_errors, other.series.energy_errors)
 
@@ -180,7 +180,7 @@ def test_an_integrator_that_cannot_be_made_is_a_failed_run():
     broken = StepControl((MonitorSettings("NoSuchMonitor"),), 1e-3)
     case = replace(case, settings=replace(case.settings, controls=(broken,)), wanted_error=10.0)
     results, _ = run_sweep([case], SerialRunner())
-    assert "NoSuchMonitor" in results[0].runs[-1].failure
+    assert "NoSuchMonitor" in results[0].runs[3].failure
     assert results[0].runs[2].failure is None
 
 
@@ -343,7 +343,7 @@ def test_folder_of_results(tmp_path, clash_result):
     for run in clash_result.runs:
         assert run.name in report
     assert "Gains over RATTLE with fixed steps" in report
-    assert [row["seed"] for row in rows_of(folder.path)] == [""] * 4 + ["2"] * 4
+    assert [row["seed"] for row in rows_of(folder.path)] == [""] * 5 + ["2"] * 5
 
 
 def test_earlier_results_are_moved_aside(tmp_path, clash_result):

@@ -110,12 +110,18 @@ def run(options: argparse.Namespace) -> int:
             )
         except AdviceError as error:
             raise UsageError(f"the trial cannot be run: {error}.") from error
-        gain = measured_gain(advice, start, platform) if options.check and advice.best is not None else None
+        gains = {}
+        if options.check and advice.best is not None:
+            bars.reset(task, description="measuring the gain", total=None)
+            gains["the best settings"] = measured_gain(advice, start, platform)
+            gains["automatic step control"] = measured_gain(advice, start, platform, automatic=True)
     print_advice(console, advice)
-    if gain is not None:
-        console.print(f"\n{_gain_in_words(*gain)}", highlight=False, soft_wrap=True, markup=False)
+    if gains:
+        console.print("\nMeasured over this trial, at equal force evaluations:", style="bold")
+    for name, gain in gains.items():
+        console.print(f"- {name}: {_gain_in_words(*gain)}", highlight=False, soft_wrap=True, markup=False)
     if options.output is not None:
-        _write(advice, start, gain, options.output)
+        _write(advice, start, gains, options.output)
         console.print(f"The trial and the advice are in {options.output}.", highlight=False, soft_wrap=True)
     return 0
 
@@ -198,13 +204,13 @@ def _gain_in_words(gain: float, failure: str | None) -> str:
     from ..comparison import two_digits
 
     if failure is not None:
-        return f"Measured: the best settings failed ({failure.rstrip('.')})."
+        return f"failed ({failure.rstrip('.')})."
     if math.isinf(gain):
-        return "Measured: the best settings reach the end, where fixed steps fail."
-    return f"Measured over this trial, at equal force evaluations: a gain of {two_digits(gain)} with the best settings."
+        return "reach the end, where fixed steps fail."
+    return f"a gain of {two_digits(gain)}."
 
 
-def _write(advice: Advice, start: TestSystem, gain: tuple[float, str | None] | None, folder: Path) -> None:
+def _write(advice: Advice, start: TestSystem, gains: dict[str, tuple[float, str | None]], folder: Path) -> None:
     """Write advice.json, trial.csv and trial.png."""
     from ..plots import save_trial
 
@@ -217,7 +223,7 @@ def _write(advice: Advice, start: TestSystem, gain: tuple[float, str | None] | N
         "resolved": advice.resolved,
         "step_size": trial.step_size,
         "largest_energy_error": trial.largest_energy_error,
-        "measured_gain": gain[0] if gain is not None and math.isfinite(gain[0]) else None,
+        "measured_gains": {name: gain if math.isfinite(gain) else None for name, (gain, _) in gains.items()},
         "candidates": [
             {
                 "monitor": candidate.monitor,

@@ -84,7 +84,8 @@ def add_parser(commands: Any) -> None:
         "--integrators",
         nargs="+",
         metavar="NAME",
-        help="VerletIntegrator, VariableVerletIntegrator, RATTLE (fixed steps), VRATTLE (default: all)",
+        help="VerletIntegrator, VariableVerletIntegrator, RATTLE (fixed steps), VRATTLE (with monitors), Automatic "
+        "(VRATTLE with automatic step control); default: all",
     )
     what.add_argument(
         "--monitors",
