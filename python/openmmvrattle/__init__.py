@@ -8,18 +8,35 @@
 >>> context = openmm.Context(system, integrator)  # doctest: +SKIP
 
 Importing this package loads its libraries into OpenMM. A library that could not be loaded is named in
-`pluginLoadFailures`; the package then works on the other platforms.
+`pluginLoadFailures`; the package then works on the other platforms. CustomVariableStepRattleIntegrator is written in
+Python alone and works on every platform, also where the compiled part of this package cannot be loaded at all; then
+VariableStepRattleIntegrator raises an OpenMMException that says why.
 """
 
+import importlib.metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import openmm
 import openmm.version
 
-from . import _build
+from .custom import ConstraintWarning, CustomVariableStepRattleIntegrator
+from .serialization import XmlSerializer
 
-__all__ = ["VariableStepRattleIntegrator", "XmlSerializer", "advise", "pluginLoadFailures"]
-__version__: str = _build.VERSION
+if TYPE_CHECKING:
+    from .advice import advise
+    from .vrattle import VariableStepRattleIntegrator
+
+__all__ = [
+    "ConstraintWarning",
+    "CustomVariableStepRattleIntegrator",
+    "VariableStepRattleIntegrator",
+    "XmlSerializer",
+    "advise",
+    "pluginLoadFailures",
+]
+# What of these needs the compiled part of the package.
+_COMPILED = ("VariableStepRattleIntegrator", "advise")
 
 # The platforms that each of our libraries serves. The CPU platform runs the kernels of Reference.
 _PLATFORMS_OF_LIBRARY: dict[str, tuple[str, ...]] = {"OpenMMVRattleReference": ("Reference", "CPU")}
@@ -61,13 +78,53 @@ def _load_plugins(folder: Path) -> list[str]:
     return failures
 
 
-_check_openmm_version(_build.OPENMM_VERSION, openmm.version.short_version)
+def _load_compiled_part() -> list[str]:
+    """Import what was compiled, put it into this module, and return what went wrong with its libraries."""
+    from . import _build
 
-from . import _vrattle  # noqa: E402
-from .serialization import XmlSerializer  # noqa: E402
-from .vrattle import VariableStepRattleIntegrator  # noqa: E402
+    _check_openmm_version(_build.OPENMM_VERSION, openmm.version.short_version)
+    from . import _vrattle
+    from .vrattle import VariableStepRattleIntegrator
 
-# Found from the extension: in an editable install the Python files lie somewhere else.
-pluginLoadFailures: list[str] = _load_plugins(Path(_vrattle.__file__).parent / "lib" / "plugins")
+    globals()["VariableStepRattleIntegrator"] = VariableStepRattleIntegrator
+    # Found from the extension: in an editable install the Python files lie somewhere else.
+    failures = _load_plugins(Path(_vrattle.__file__).parent / "lib" / "plugins")
+    from .advice import advise
 
-from .advice import advise  # noqa: E402 (it uses what is above)
+    globals()["advise"] = advise
+    return failures
+
+
+if not TYPE_CHECKING:  # a type checker would take every name for granted
+
+    def __getattr__(name: str) -> object:
+        """Say why there is no VariableStepRattleIntegrator."""
+        if name in _COMPILED:
+            raise openmm.OpenMMException(_compiled_part_failure)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _version() -> str:
+    """The version that this copy was built as, or what the installer knows where nothing was built."""
+    try:
+        from ._build import VERSION
+    except ImportError:
+        try:
+            return importlib.metadata.version("openmm-vrattle")
+        except importlib.metadata.PackageNotFoundError:
+            return "unknown"
+    return VERSION
+
+
+__version__: str = _version()
+_compiled_part_failure = ""
+try:
+    pluginLoadFailures: list[str] = _load_compiled_part()
+except (ImportError, OSError, openmm.OpenMMException) as error:
+    _compiled_part_failure = (
+        f"There is no VariableStepRattleIntegrator, as the compiled part of openmmvrattle cannot be used: {error} "
+        "CustomVariableStepRattleIntegrator, which is written in Python alone, can be used."
+    )
+    pluginLoadFailures = [_compiled_part_failure]
+    # Written so that type checkers, which read __all__, take the class for granted.
+    globals()["__all__"] = [name for name in __all__ if name not in _COMPILED]

@@ -1,19 +1,22 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""OpenMM's XmlSerializer, returning our own class for our own integrators."""
+"""OpenMM's XmlSerializer, returning our own classes for our own integrators."""
 
 from __future__ import annotations
 
+import sys
+
 import openmm
 
-from .vrattle import VariableStepRattleIntegrator
+from .custom import CustomVariableStepRattleIntegrator
 
 
 class XmlSerializer(openmm.XmlSerializer):
-    """OpenMM's XmlSerializer in all respects but one: what it returns for a VariableStepRattleIntegrator is one.
+    """OpenMM's XmlSerializer in all respects but one: what it returns for one of our integrators is of our own class.
 
-    openmm.XmlSerializer writes the same XML and reads it as well, but as it knows OpenMM's own classes only, it returns
-    the integrator as a bare openmm.Integrator, for VariableStepRattleIntegrator.cast().
+    openmm.XmlSerializer writes the same XML and reads it as well, but as it knows OpenMM's own classes only, it
+    returns a VariableStepRattleIntegrator as a bare openmm.Integrator, and a CustomVariableStepRattleIntegrator as an
+    openmm.CustomIntegrator, for the method cast() of either class.
     """
 
     @staticmethod
@@ -28,6 +31,10 @@ class XmlSerializer(openmm.XmlSerializer):
 
 
 def _with_class(result: object) -> object:
-    if isinstance(result, openmm.Integrator) and VariableStepRattleIntegrator.isinstance(result):
-        return VariableStepRattleIntegrator.cast(result)
+    # The compiled class exists only where it could be loaded.
+    compiled = sys.modules.get(f"{__package__}.vrattle")
+    classes = [CustomVariableStepRattleIntegrator] + ([compiled.VariableStepRattleIntegrator] if compiled else [])
+    for each in classes:
+        if isinstance(result, openmm.Integrator) and each.isinstance(result):
+            return each.cast(result)
     return result

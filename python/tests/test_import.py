@@ -3,8 +3,10 @@
 """Importing the package: the check of OpenMM's version, and the loading of the plugin libraries."""
 
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import openmm
 import openmm.version
@@ -39,22 +41,76 @@ def test_another_minor_version_is_refused_in_plain_words(running):
     assert 'pip install "openmm==8.6.*"' in message
 
 
+def run_script(script: str, **options: object) -> list[str]:
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, **options)
+    return result.stdout.splitlines()
+
+
+# Asks for both integrators, and runs the one that is written in Python.
+WITHOUT_COMPILED_PART = """
+import openmm, openmmvrattle
+for name in ("CustomVariableStepRattleIntegrator", "VariableStepRattleIntegrator"):
+    try:
+        getattr(openmmvrattle, name)
+        print("there is a", name)
+    except Exception as error:
+        print(type(error).__name__, error)
+try:
+    from openmmvrattle import VariableStepRattleIntegrator
+except Exception as error:
+    print(type(error).__name__, error)
+print("openmmvrattle._vrattle" in sys.modules, openmmvrattle.__version__, openmmvrattle.pluginLoadFailures)
+from openmmvrattle import *
+from openmmvrattle.testsystems import rigid_waters
+water = rigid_waters()
+integrator = CustomVariableStepRattleIntegrator(0.001)
+context = openmm.Context(water.system, integrator, openmm.Platform.getPlatform("Reference"))
+context.setPositions(water.positions)
+context.setVelocities(water.velocities)
+integrator.step(5)
+copy = XmlSerializer.deserialize(XmlSerializer.serialize(integrator))
+print(type(copy).__name__, integrator.getStepDensity() != 1)
+"""
+
+
+def check_without_compiled_part(lines: list[str], reason: str) -> None:
+    there, missing, imported, state, run = lines
+    assert there == "there is a CustomVariableStepRattleIntegrator"
+    for message in (missing, imported):
+        assert message.startswith("OpenMMException There is no VariableStepRattleIntegrator")
+        assert reason in message and "CustomVariableStepRattleIntegrator, which is written in Python" in message
+    assert state.startswith("False ") and reason in state
+    assert run == "CustomVariableStepRattleIntegrator True"
+
+
 def test_import_checks_the_version_first():
-    """With another OpenMM the package stops before it loads any compiled code."""
-    script = (
-        "import sys, openmm.version\n"
-        "openmm.version.short_version = '8.7.0'\n"
-        "try:\n"
-        "    import openmmvrattle\n"
-        "except Exception as error:\n"
-        "    print(type(error).__name__, error)\n"
-        "print('openmmvrattle._vrattle' in sys.modules)\n"
+    """With another OpenMM no compiled code is loaded, and what is written in Python alone can be used."""
+    lines = run_script("import sys, openmm.version\nopenmm.version.short_version = '8.7.0'\n" + WITHOUT_COMPILED_PART)
+    check_without_compiled_part(lines, "openmmvrattle was built for OpenMM ")
+    assert "8.7.0" in lines[1]
+
+
+def test_an_extension_that_cannot_be_loaded():
+    lines = run_script("import sys\nsys.modules['openmmvrattle._vrattle'] = None\n" + WITHOUT_COMPILED_PART)
+    lines[3] = lines[3].replace("True", "False", 1)  # It is None there.
+    check_without_compiled_part(lines, "_vrattle")
+
+
+def test_the_python_files_alone(tmp_path):
+    """On a machine for which nothing of the package was ever built."""
+    package = tmp_path / "openmmvrattle"
+    shutil.copytree(
+        Path(openmmvrattle.__file__).parent,
+        package,
+        ignore=lambda folder, names: [
+            n for n in names if not n.endswith((".py", ".json")) and "." in n or n in ("vrattle.py", "_build.py", "lib")
+        ],
     )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    error, loaded = result.stdout.splitlines()
-    assert error.startswith("OpenMMException openmmvrattle was built for OpenMM ")
-    assert "8.7.0" in error
-    assert loaded == "False"
+    assert not list(package.glob("*.so")) and not (package / "lib").exists()
+    script = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n" + WITHOUT_COMPILED_PART
+    lines = run_script(script + "print(openmmvrattle.__file__)", cwd=tmp_path)
+    assert lines.pop() == str(package / "__init__.py")
+    check_without_compiled_part(lines, "_build")
 
 
 def test_a_missing_library_is_reported(tmp_path):

@@ -1,0 +1,220 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The settings of CustomVariableStepRattleIntegrator, and the checks of what a user gives for them."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass, field
+
+import openmm
+from openmm import unit
+
+PREFIX = "vrattle_"
+VERSION = 1
+SEMI_EXPLICIT, EXPLICIT, BOUNDED = 0, 1, 2
+MONITOR_KINDS = (
+    "ConstraintMultipliers",
+    "ConstraintForce",
+    "AppliedForce",
+    "ConstraintAndAppliedForce",
+    "MultiplierPNorm",
+    "ForcePNorm",
+    "VectorField",
+    "MaxForce",
+    "ArcLength",
+    "MaxParticleArcLength",
+    "ForceGroupEnergy",
+)
+"""The kinds of monitor by their numbers, the same as of VariableStepRattleIntegrator."""
+
+
+INSTEAD = "VariableStepRattleIntegrator, which runs on the platforms Reference and CPU"
+REFUSED_MONITORS = {
+    "ConstraintMultipliers": "needs the constraints' multipliers, which OpenMM does not tell: use ConstraintForce",
+    "MultiplierPNorm": "needs the constraints' multipliers, which OpenMM does not tell: use ConstraintForce",
+    "MaxForce": "needs a maximum over particles, and a CustomIntegrator can only add up: use ForcePNorm",
+    "MaxParticleArcLength": "needs a maximum over particles, and a CustomIntegrator can only add up: use ArcLength",
+}
+
+
+@dataclass
+class Monitor:
+    """One monitor: its kind, weight and power, and the reference value that was set (0: from the first step)."""
+
+    kind: int
+    weight: float = 1.0
+    power: float = 1.0
+    reference: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return MONITOR_KINDS[self.kind]
+
+
+@dataclass
+class Settings:
+    """Every setting of the integrator. A bound of -1 stands for the default, which follows the nominal step."""
+
+    nominal: float
+    minimum: float = -1.0
+    maximum: float = -1.0
+    update: int = SEMI_EXPLICIT
+    monitors: list[Monitor] = field(default_factory=lambda: [Monitor(MONITOR_KINDS.index("ConstraintForce"))])
+    order: float = 8.0
+    group: int = 31
+    tolerance_set: bool = False
+
+    @property
+    def minimum_in_force(self) -> float:
+        return self.nominal / 50 if self.minimum < 0 else self.minimum
+
+    @property
+    def maximum_in_force(self) -> float:
+        return 2 * self.nominal if self.maximum < 0 else self.maximum
+
+    def uses(self, *names: str) -> bool:
+        """Whether one of the monitors is of one of these kinds."""
+        return any(monitor.name in names for monitor in self.monitors)
+
+    @property
+    def uses_constraint_force(self) -> bool:
+        return self.uses("ConstraintForce", "ConstraintAndAppliedForce")
+
+    @property
+    def uses_velocities(self) -> bool:
+        return self.uses("VectorField", "ArcLength")
+
+    @property
+    def is_iterative(self) -> bool:
+        """Whether the next density depends on the constraint forces or velocities of the step that it belongs to."""
+        return self.uses_constraint_force or (self.update == SEMI_EXPLICIT and self.uses_velocities)
+
+    def globals(self) -> dict[str, float]:
+        """The settings as global variables of a CustomIntegrator: what a copy of the integrator is made from."""
+        result = {
+            "version": float(VERSION),
+            "nominalStep": self.nominal,
+            "minimumStep": self.minimum,
+            "maximumStep": self.maximum,
+            "updateMethod": float(self.update),
+            "normOrder": self.order,
+            "energyGroup": float(self.group),
+            "toleranceSet": float(self.tolerance_set),
+            "monitors": float(len(self.monitors)),
+        }
+        for k, monitor in enumerate(self.monitors):
+            result[f"kind{k}"] = float(monitor.kind)
+            result[f"weight{k}"] = monitor.weight
+            result[f"power{k}"] = monitor.power
+            result[f"setReference{k}"] = monitor.reference
+        return result | self.bounds()
+
+    @staticmethod
+    def from_globals(values: dict[str, float]) -> Settings:
+        """The settings from the global variables."""
+        return Settings(
+            nominal=values["nominalStep"],
+            minimum=values["minimumStep"],
+            maximum=values["maximumStep"],
+            update=int(values["updateMethod"]),
+            monitors=[
+                Monitor(int(values[f"kind{k}"]), values[f"weight{k}"], values[f"power{k}"], values[f"setReference{k}"])
+                for k in range(int(values["monitors"]))
+            ],
+            order=values["normOrder"],
+            group=int(values["energyGroup"]),
+            tolerance_set=bool(values["toleranceSet"]),
+        )
+
+    def bounds(self) -> dict[str, float]:
+        """What the Moebius function B of docs/method.md, section 6, is computed from, and the a of the bounded
+        update."""
+        a = self.nominal / self.maximum_in_force if self.maximum_in_force > 0 else 0.0
+        lower = min(4 * a / 3, (1 + 2 * a) / 3) if self.update == BOUNDED else a
+        if self.minimum_in_force > 0:
+            upper = self.nominal / self.minimum_in_force
+            curvature = (1 - lower) / (upper - 1)
+            slope = upper * curvature
+        else:
+            upper, curvature, slope = 16.0, 0.0, 1 - lower
+        return {
+            "smallestDensity": a,
+            "boundOffset": lower,
+            "boundSlope": slope,
+            "boundCurvature": curvature,
+            # The first guess of a start with known reference values: the density of short steps.
+            "startDensity": upper,
+        }
+
+
+def density_of(settings: Settings, values: dict[str, float], name: str) -> float:
+    """u = B(U_rel) from values U_k that have a name in the program."""
+    total = weights = 0.0
+    for k, monitor in enumerate(settings.monitors):
+        relative = (values[f"{name}{k}"] / values[f"reference{k}"]) ** monitor.power
+        total += (monitor.weight * relative) ** 2
+        weights += monitor.weight**2
+    relative = math.sqrt(total / weights)
+    bounds = settings.bounds()
+    return (bounds["boundOffset"] + bounds["boundSlope"] * relative) / (1 + bounds["boundCurvature"] * relative)
+
+
+def check(settings: Settings) -> None:
+    """Raise an OpenMMException if settings do not fit together."""
+    if settings.minimum > 0 and settings.minimum >= settings.nominal:
+        raise error(
+            f"the minimum step size ({settings.minimum:g} ps) must be smaller than the nominal one "
+            f"({settings.nominal:g} ps)"
+        )
+    if settings.maximum > 0 and settings.maximum <= settings.nominal:
+        raise error(
+            f"the maximum step size ({settings.maximum:g} ps) must be larger than the nominal one "
+            f"({settings.nominal:g} ps)"
+        )
+    if settings.update == EXPLICIT and settings.uses_constraint_force:
+        raise error(
+            "the update Explicit needs the constraint force before the step is taken, which a CustomIntegrator does "
+            f"not know: take SemiExplicit or Bounded, or a monitor without constraint force, or {INSTEAD}"
+        )
+
+
+def error(message: str) -> openmm.OpenMMException:
+    return openmm.OpenMMException(f"CustomVariableStepRattleIntegrator: {message}")
+
+
+def number(value: object, name: str, target: unit.Unit = unit.dimensionless) -> float:
+    """A number or a Quantity as a number in the unit `target`."""
+    wanted = "a plain number" if target is unit.dimensionless else f"a number or a Quantity in {target.get_name()}s"
+    if unit.is_quantity(value):
+        if not value.unit.is_compatible(target):
+            raise TypeError(f"{name} must be {wanted}, not a Quantity in {value.unit.get_name()}")
+        value = value.value_in_unit(target)
+    try:
+        if isinstance(value, (str, bytes)):  # float() would read these
+            raise TypeError
+        return float(value)
+    except TypeError:
+        raise TypeError(f"{name} must be {wanted}, not {value!r}") from None
+
+
+def integer(value: object, name: str) -> int:
+    """`value` as an int, if it is an integer of any kind."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be an integer, not {value!r}") from None
+
+
+def positive(value: float, name: str, unit_name: str = "") -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise error(f"{name} must be positive and finite, not {value:g}{' ' + unit_name if unit_name else ''}")
+    return value
+
+
+def bound(size: float | unit.Quantity, name: str) -> float:
+    value = number(size, "size", unit.picosecond)
+    if not (math.isfinite(value) and value >= 0):
+        raise error(f"the {name} step size must be positive, or 0 for none, not {value:g} ps")
+    return value
