@@ -25,8 +25,7 @@ import pytest
 from markdown_it import MarkdownIt
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
-from openmmvrattle.comparison import compare
-from openmmvrattle.testsystems import SYSTEMS, alanine_dipeptide
+from openmmvrattle.testsystems import alanine_dipeptide
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -154,7 +153,7 @@ def test_a_picture_is_small_and_shown(picture: Path) -> None:
 def test_the_first_picture_says_what_the_readme_says(tmp_path: Path) -> None:
     """It is drawn anew; the motion is chaotic after the first whip, so last digits may differ."""
     script = runpy.run_path(str(ROOT / "docs" / "draw_pictures.py"))
-    figure = script["draw"](compare(SYSTEMS["double-pendulum"]()))
+    figure = script["draw"](script["run_comparison"]())
     figure.savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
