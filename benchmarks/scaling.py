@@ -14,6 +14,7 @@ A table and one JSON line a measurement are printed. `make scaling` builds the p
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import subprocess
 import tempfile
@@ -62,7 +63,7 @@ SYSTEMS = {
 }
 
 
-def measure(program: str, name: str, count: int, update: str) -> dict:
+def measure(program: str, name: str, count: int, update: str, threads: int) -> dict:
     """Steps of one system, in a process of its own."""
     masses, pairs, lengths, positions = SYSTEMS[name](count)
     gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
@@ -81,13 +82,14 @@ def measure(program: str, name: str, count: int, update: str) -> dict:
             ):
                 file.write(np.ascontiguousarray(array, dtype=kind).tobytes())
         steps = max(3, 2_000_000 // len(pairs))
-        command = [program, str(path), str(problems.STEP), str(steps), "5", update]
+        command = [program, str(path), str(problems.STEP), str(steps), "5", update, str(threads)]
         output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     result = json.loads(output)
     return {
         "benchmark": "scaling",
         "system": name,
         "update": update,
+        "threads": threads,
         **result,
         "nanoseconds_per_constraint": 1e9 * result["step_seconds"] / result["constraints"],
         "kilobytes_per_constraint": result["kilobytes"] / result["constraints"],
@@ -110,33 +112,35 @@ def main() -> None:
     parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
     parser.add_argument("--constraints", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--update", nargs="+", choices=["Explicit", "SemiExplicit"], default=["Explicit"])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--context", type=int, default=0, help="bonds of a chain whose Context OpenMM is to create")
     arguments = parser.parse_args()
     table = rich.table.Table(title="A step of the solver alone, at 1e-8")
-    for column in ("system", "update", "constraints", "ns each", "growth", "kB each", "set up (s)", "updates", "error"):
+    columns = ("system", "update", "threads", "constraints", "ns each", "growth", "kB each", "set up (s)", "updates")
+    for column in (*columns, "error"):
         table.add_column(column, justify="left" if column in ("system", "update") else "right")
-    for name in arguments.system:
-        for update in arguments.update:
-            first = None
-            for count in arguments.constraints:
-                result = measure(arguments.program, name, count, update)
-                first = first or result["nanoseconds_per_constraint"]
-                result["growth"] = result["nanoseconds_per_constraint"] / first
-                print(json.dumps(result), flush=True)
-                table.add_row(
-                    name,
-                    update,
-                    str(result["constraints"]),
-                    f"{result['nanoseconds_per_constraint']:.1f}",
-                    f"{result['growth']:.2f}",
-                    f"{result['kilobytes_per_constraint']:.2f}",
-                    f"{result['setup_seconds']:.2f}",
-                    f"{result['iterations_per_step']:.2f}",
-                    f"{result['error']:.1e}",
-                )
+    for name, update, threads in itertools.product(arguments.system, arguments.update, arguments.threads):
+        first = None
+        for count in arguments.constraints:
+            result = measure(arguments.program, name, count, update, threads)
+            first = first or result["nanoseconds_per_constraint"]
+            result["growth"] = result["nanoseconds_per_constraint"] / first
+            print(json.dumps(result), flush=True)
+            table.add_row(
+                name,
+                update,
+                str(threads),
+                str(result["constraints"]),
+                f"{result['nanoseconds_per_constraint']:.1f}",
+                f"{result['growth']:.2f}",
+                f"{result['kilobytes_per_constraint']:.2f}",
+                f"{result['setup_seconds']:.2f}",
+                f"{result['iterations_per_step']:.2f}",
+                f"{result['error']:.1e}",
+            )
     rich.console.Console(width=130).print(table)
     if arguments.context:
-        ours = measure(arguments.program, "chain", arguments.context, "Explicit")
+        ours = measure(arguments.program, "chain", arguments.context, "Explicit", 1)
         theirs = context_seconds(arguments.context)
         result = {
             "benchmark": "scaling-context",

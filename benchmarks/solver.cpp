@@ -5,9 +5,10 @@
 // every Context of the platforms Reference and CPU, which takes minutes for 200,000 coupled bonds. benchmarks/scaling.py
 // writes the problem and reads the JSON line.
 //
-//     solver PROBLEM STEP STEPS REPEATS Explicit|SemiExplicit
+//     solver PROBLEM STEP STEPS REPEATS Explicit|SemiExplicit THREADS
 
 #include "VRattleDynamics.h"
+#include "openmm/internal/ThreadPool.h"
 #include <algorithm>
 #include <chrono>
 #include <cmath>
@@ -51,7 +52,7 @@ long kilobytes() {
 } // namespace
 
 int main(int argc, char** argv) {
-    if (argc != 6)
+    if (argc != 7)
         return 2;
     // Numbers of particles and constraints, masses, pairs, lengths, positions, velocities.
     std::ifstream file(argv[1], std::ios::binary);
@@ -72,6 +73,13 @@ int main(int argc, char** argv) {
     const double begin = seconds();
     VRattleDynamics dynamics(masses, constraints);
     const double constructed = seconds();
+    OpenMM::ThreadPool threads(std::stoi(argv[6]));
+    dynamics.setParallel(
+        [&](const std::function<void(int)>& task) {
+            threads.execute([&task](OpenMM::ThreadPool&, int thread) { task(thread); });
+            threads.waitForThreads();
+        },
+        threads.getNumThreads());
     VRattleDynamics::Settings settings = {};
     settings.stepSize = stepSize;
     settings.minimumStep = stepSize / 50;

@@ -15,8 +15,8 @@ namespace OpenMMVRattle {
  * an order of elimination with little fill. Where each number goes is worked out once; a factorisation then runs through a fixed
  * schedule, allocates nothing, and costs time linear in the number of entries of L, that is, of constraints.
  *
- * As ConstraintSystem, factorize() and solve() take a first constraint from which on they work. It must be 0 or
- * getFirstGeneral().
+ * As in ConstraintSystem, a part of the constraints may be worked on, all or one of getGeneralParts(), and several parts by several
+ * threads at the same time.
  */
 class ConstraintMatrix {
 public:
@@ -27,9 +27,14 @@ public:
      * @throws DependentConstraints    if a pivot D_k is not larger than MIN_RELATIVE_PIVOT K_kk: the constraints of
      *                                 that cluster depend on each other
      */
-    void factorize(const ConstraintSystem::Jacobian& jacobian, int first = 0);
+    void factorize(const ConstraintSystem::Jacobian& jacobian);
+    /** The same for a part, returning the first constraint whose pivot is too small, or REGULAR. */
+    int tryToFactorize(const ConstraintSystem::Jacobian& jacobian, const ConstraintSystem::Part& part);
+    static constexpr int REGULAR = -1;
+    /** Say what is wrong with a constraint that tryToFactorize() returned. */
+    [[noreturn]] void throwDependent(int constraint, const ConstraintSystem::Jacobian& jacobian) const;
     /** Replace x by K^-1 x. */
-    void solve(std::vector<double>& x, int first = 0) const;
+    void solve(std::vector<double>& x, const ConstraintSystem::Part& part = ConstraintSystem::ALL) const;
     /**
      * A pivot below this fraction of its diagonal entry means dependent constraints. Dependent sets leave pivots of
      * 1e-16 or negative ones, while a legitimate chain of mass ratio R gives 2/R.
@@ -38,14 +43,14 @@ public:
 
 private:
     const ConstraintSystem& system;
-    size_t firstGeneralCoupling;
-    std::vector<size_t> columnStart;  // of the entries of L below the diagonal
-    std::vector<int> rows;            // of these entries
-    std::vector<size_t> updateStart;  // of the updates that the elimination of a column makes
-    std::vector<size_t> updates;      // where they go: an entry below the diagonal, or numEntries + the row on it
-    std::vector<size_t> couplingSlots;
-    std::vector<double> values;       // the entries below the diagonal, then the diagonal
-    std::vector<double> inversePivots, columnScratch;
+    std::vector<size_t> couplingStart;   // of the couplings of each constraint with those before it
+    std::vector<size_t> columnStart;     // of the entries of L below the diagonal
+    std::vector<int> rows;               // of these entries
+    std::vector<size_t> updateStart;     // of the updates that the elimination of a column makes
+    std::vector<unsigned> updates;       // where they go: an entry below the diagonal, or numEntries + the row on it
+    std::vector<unsigned> couplingSlots; // where the couplings go, as updates
+    std::vector<double> values;          // the entries below the diagonal, then the diagonal
+    std::vector<double> inversePivots;
 };
 
 } // namespace OpenMMVRattle

@@ -19,6 +19,8 @@ namespace {
 
 // The number of particles of a block, whose positions, velocities and forces take 150 kB.
 const int BLOCK_SIZE = 1024;
+// The number of constraints that a part of the general clusters is filled up to.
+const int PART_SIZE = 1000;
 
 std::string listParticles(const vector<int>& particles) {
     const size_t maxListed = 12;
@@ -95,12 +97,16 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
                                                shape.lengths, particles, first));
     }
     firstGeneral = (int) constraints.size();
+    auto hasNoExpression = [&](const vector<int>& cluster) {
+        return std::none_of(cluster.begin(), cluster.end(), [&](int k) { return given.isExpression(k); });
+    };
+    std::stable_partition(general.begin(), general.end(), hasNoExpression);
     for (const vector<int>& cluster : general)
         appendCluster(given, cluster);
     groupExpressions(given);
     findStretches();
     findCouplings();
-    classifyParticles(isInBatch);
+    findParts(isInBatch);
     findBlocks();
     isFreeToTranslate =
         expressions.empty() && std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
@@ -356,16 +362,32 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
                   "where it holds");
 }
 
-void ConstraintSystem::classifyParticles(const vector<char>& isInBatch) {
+// The general clusters in parts, with their particles; and the particles without constraints.
+void ConstraintSystem::findParts(const vector<char>& isInBatch) {
     vector<char> isGeneral(masses.size(), false);
-    for (int k = firstGeneral; k < getNumConstraints(); k++)
-        if (!isExpression(k))
-            isGeneral[constraints[k].particle1] = isGeneral[constraints[k].particle2] = true;
-    for (const ExpressionEntry& entry : expressionEntries)
-        isGeneral[entry.particle] = true;
+    for (int c = 0; c < (int) clusters.size(); c++) {
+        const Cluster& cluster = clusters[c];
+        if (cluster.first < firstGeneral)
+            continue;
+        bool hasExpressions = false;
+        for (int k = cluster.first; k < cluster.first + cluster.size; k++)
+            hasExpressions = hasExpressions || isExpression(k);
+        const bool isLastOpen = !generalParts.empty() && generalParts.back().hasExpressions == hasExpressions &&
+                                (hasExpressions || generalParts.back().end - generalParts.back().first < PART_SIZE);
+        const int numParticles = (int) generalParticles.size();
+        if (!isLastOpen)
+            generalParts.push_back({cluster.first, cluster.first, hasExpressions, numParticles, numParticles});
+        for (int i : getClusterParticles(c))
+            if (inverseMasses[i] > 0) {
+                isGeneral[i] = true;
+                generalParticles.push_back(i);
+            }
+        generalParts.back().end = cluster.first + cluster.size;
+        generalParts.back().endParticle = (int) generalParticles.size();
+    }
     for (int i = 0; i < getNumParticles(); i++)
-        if (inverseMasses[i] > 0 && !isInBatch[i])
-            (isGeneral[i] ? generalParticles : freeParticles).push_back(i);
+        if (inverseMasses[i] > 0 && !isInBatch[i] && !isGeneral[i])
+            freeParticles.push_back(i);
 }
 
 void ConstraintSystem::findBlocks() {
@@ -439,25 +461,35 @@ double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<doub
     return std::fabs(g[row.constraint]) / (std::sqrt(square) * EXPRESSION_LENGTH);
 }
 
-double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby, int first) const {
+// Do something for each distance constraint of a part.
+template <class Task> void ConstraintSystem::forDistances(const Part& part, const Task& task) const {
+    for (const Stretch& stretch : distanceStretches) {
+        if (stretch.first >= part.end)
+            break;
+        const int end = std::min(part.end, stretch.end);
+        for (int k = std::max(part.first, stretch.first); k < end; k++)
+            task(k);
+    }
+}
+
+double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby,
+                                  const Part& part) const {
     double largest = 0;
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
-            Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
-            double length = constraints[k].length;
-            g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
-            double size = std::fabs(g[k]);
-            if (std::isnan(size))
-                return size;
-            largest = std::max(largest, size);
-        }
-    for (const auto& group : groups)
-        group->evaluate(q, g);
-    for (const ExpressionRow& row : expressionRows) {
-        const double size = findErrorOf(row, g, nearby);
-        if (std::isnan(size))
-            return size;
-        largest = std::max(largest, size);
+    auto keepLargest = [&](double size) {
+        if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
+            largest = size;
+    };
+    forDistances(part, [&](int k) {
+        Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
+        double length = constraints[k].length;
+        g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
+        keepLargest(std::fabs(g[k]));
+    });
+    if (part.hasExpressions) {
+        for (const auto& group : groups)
+            group->evaluate(q, g);
+        for (const ExpressionRow& row : expressionRows)
+            keepLargest(findErrorOf(row, g, nearby));
     }
     return largest;
 }
@@ -474,30 +506,33 @@ int ConstraintSystem::findLargest(const vector<double>& g, const Jacobian& nearb
 }
 
 // The distance constraints' part of G(x).
-void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jacobian, int first) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++)
-            jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
+void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jacobian, const Part& part) const {
+    forDistances(part, [&](int k) {
+        jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
+    });
 }
 
-void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, int first) const {
-    evaluateDistanceRows(q, jacobian, first);
-    for (const auto& group : groups)
-        group->evaluateJacobian(q, jacobian);
+void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, const Part& part) const {
+    evaluateDistanceRows(q, jacobian, part);
+    if (part.hasExpressions)
+        for (const auto& group : groups)
+            group->evaluateJacobian(q, jacobian);
 }
 
 void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, Jacobian& jacobian,
-                                                int first) const {
-    evaluateDistanceRows(v, jacobian, first);
-    for (const auto& group : groups)
-        group->evaluateVelocityJacobian(q, v, jacobian);
+                                                const Part& part) const {
+    evaluateDistanceRows(v, jacobian, part);
+    if (part.hasExpressions)
+        for (const auto& group : groups)
+            group->evaluateVelocityJacobian(q, v, jacobian);
 }
 
 void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result,
-                                int first) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++)
-            result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]);
+                                const Part& part) const {
+    forDistances(
+        part, [&](int k) { result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]); });
+    if (!part.hasExpressions)
+        return;
     for (const ExpressionRow& row : expressionRows) {
         double sum = 0;
         for (int entry = row.first; entry < row.end; entry++)
@@ -507,12 +542,13 @@ void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w,
 }
 
 void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result,
-                                        int first) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
-            int i = constraints[k].particle1, j = constraints[k].particle2;
-            result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
-        }
+                                        const Part& part) const {
+    forDistances(part, [&](int k) {
+        int i = constraints[k].particle1, j = constraints[k].particle2;
+        result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
+    });
+    if (!part.hasExpressions)
+        return;
     for (const ExpressionRow& row : expressionRows) {
         double sum = 0;
         for (int entry = row.first; entry < row.end; entry++) {
@@ -524,25 +560,25 @@ void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<V
 }
 
 void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = stretch.first; k < stretch.end; k++) {
-            Vec3 force = jacobian[k] * x[k];
-            result[constraints[k].particle1] += force;
-            result[constraints[k].particle2] -= force;
-        }
+    forDistances(ALL, [&](int k) {
+        Vec3 force = jacobian[k] * x[k];
+        result[constraints[k].particle1] += force;
+        result[constraints[k].particle2] -= force;
+    });
     for (size_t e = 0; e < expressionEntries.size(); e++)
         result[expressionEntries[e].particle] += jacobian[getNumConstraints() + e] * x[expressionEntries[e].constraint];
 }
 
 void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vector<double>& x, double scale,
-                                             vector<Vec3>& result, int first) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
-            int i = constraints[k].particle1, j = constraints[k].particle2;
-            Vec3 force = jacobian[k] * (scale * x[k]);
-            result[i] += force * inverseMasses[i];
-            result[j] -= force * inverseMasses[j];
-        }
+                                             vector<Vec3>& result, const Part& part) const {
+    forDistances(part, [&](int k) {
+        int i = constraints[k].particle1, j = constraints[k].particle2;
+        Vec3 force = jacobian[k] * (scale * x[k]);
+        result[i] += force * inverseMasses[i];
+        result[j] -= force * inverseMasses[j];
+    });
+    if (!part.hasExpressions)
+        return;
     for (size_t e = 0; e < expressionEntries.size(); e++) {
         const int i = expressionEntries[e].particle;
         result[i] +=
@@ -551,14 +587,14 @@ void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vec
 }
 
 void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result,
-                                         int first) const {
-    for (const Stretch& stretch : distanceStretches)
-        for (int k = std::max(first, stretch.first); k < stretch.end; k++) {
-            Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
-            result[k] = w.dot(w) * inverseSquareLengths[k];
-        }
-    for (const auto& group : groups)
-        group->evaluateCurvature(q, v, result);
+                                         const Part& part) const {
+    forDistances(part, [&](int k) {
+        Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
+        result[k] = w.dot(w) * inverseSquareLengths[k];
+    });
+    if (part.hasExpressions)
+        for (const auto& group : groups)
+            group->evaluateCurvature(q, v, result);
 }
 
 void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, vector<double>& result) const {

@@ -6,6 +6,7 @@
 
 #include "ExpressionGroup.h"
 #include "openmm/Vec3.h"
+#include <limits>
 #include <memory>
 #include <string>
 #include <utility>
@@ -33,9 +34,9 @@ struct DistanceConstraint {
  * it is the same for g and for 1000 g, and one tolerance serves these constraints too.
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
- * neighbours: first the small clusters that come in batches of one shape, then the general ones. The functions below take
- * a first constraint and work on those from there on: 0 for all, getFirstGeneral() for the general clusters. A cluster with
- * an expression is general. Distance constraints between two particles of mass zero cannot move anything and are left out.
+ * neighbours: first the small clusters that come in batches of one shape, then the general ones, and of these the ones
+ * with an expression last. The functions below work on a part of them: all, or one of getGeneralParts(). Distance
+ * constraints between two particles of mass zero cannot move anything and are left out.
  */
 class ConstraintSystem {
 public:
@@ -44,6 +45,17 @@ public:
      * of its row that acts on particle 1, 1/nm. The rows of expressions lie behind, an entry for each particle.
      */
     typedef std::vector<OpenMM::Vec3> Jacobian;
+    /**
+     * Whole clusters that are neighbours in the internal order: the constraints first, ..., end - 1. Parts have no particle and no
+     * constraint in common, so that threads may work on them at the same time.
+     */
+    struct Part {
+        int first, end;
+        bool hasExpressions;              // all expressions are in one part
+        int firstParticle, endParticle;   // of getGeneralParticles()
+    };
+    /** All constraints. */
+    static constexpr Part ALL = {0, std::numeric_limits<int>::max(), true, 0, 0};
     /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
     struct Cluster {
         int first, size;
@@ -146,7 +158,14 @@ public:
     int getFirstGeneral() const {
         return firstGeneral;
     }
-    /** The particles with mass whose cluster is in no batch. */
+    /**
+     * The general clusters in parts, each a few clusters that are worked through together while the processor's caches have
+     * them; those with expressions are one part.
+     */
+    const std::vector<Part>& getGeneralParts() const {
+        return generalParts;
+    }
+    /** The particles with mass whose cluster is in no batch, part by part. */
     const std::vector<int>& getGeneralParticles() const {
         return generalParticles;
     }
@@ -168,31 +187,31 @@ public:
      * @return the largest relative error of a constraint, or a NaN
      */
     double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, const Jacobian& nearby,
-                    int first = 0) const;
+                    const Part& part = ALL) const;
     /** The index of the constraint with the largest relative error. */
     int findLargest(const std::vector<double>& g, const Jacobian& nearby) const;
     /** G(q), the Jacobian. */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, int first = 0) const;
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, const Part& part = ALL) const;
     /**
      * G(v), the matrix whose rows are (d^2g/dq^2 v)^T at q: half the derivative of g''(v,v) with respect to v. For distance
      * constraints it is the Jacobian with v in place of q, since they are quadratic (paper, Lemma 4.1).
      */
     void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                                  Jacobian& jacobian, int first = 0) const;
+                                  Jacobian& jacobian, const Part& part = ALL) const;
     /** G w. */
     void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
-                  int first = 0) const;
+                  const Part& part = ALL) const;
     /** G M^-1 f. */
     void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f, std::vector<double>& result,
-                          int first = 0) const;
+                          const Part& part = ALL) const;
     /** result += G^T x, as forces on the particles. */
     void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
     /** result += scale M^-1 G^T x. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
-                               std::vector<OpenMM::Vec3>& result, int first = 0) const;
+                               std::vector<OpenMM::Vec3>& result, const Part& part = ALL) const;
     /** g''(v,v), the second derivative of the constraints along v at q. */
     void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                           std::vector<double>& result, int first = 0) const;
+                           std::vector<double>& result, const Part& part = ALL) const;
     /**
      * The factor that turns a multiplier of constraint index into that of the constraint as users see it: |r|^2 - L^2
      * (kJ/mol/nm^2) for a distance, and the expression itself (kJ/mol over the unit of g), whose factor is 1.
@@ -235,9 +254,10 @@ private:
     void groupExpressions(const Given& given);
     void findStretches();
     void findCouplings();
-    void classifyParticles(const std::vector<char>& isInBatch);
+    void findParts(const std::vector<char>& isInBatch);
     void findBlocks();
-    void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, int first) const;
+    template <class Task> void forDistances(const Part& part, const Task& task) const;
+    void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
     bool isFreeToTranslate;
@@ -255,6 +275,7 @@ private:
     std::vector<Coupling> couplings;
     std::vector<std::unique_ptr<ClusterBatch>> batches;
     std::vector<Block> blocks;
+    std::vector<Part> generalParts;
     std::vector<int> generalParticles, freeParticles;
 };
 

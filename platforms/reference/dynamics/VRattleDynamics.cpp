@@ -179,10 +179,18 @@ void VRattleDynamics::ensureFactor(FactorScope scope) {
     }
     if (factorScope >= scope)
         return;
-    const int first = scope == FullFactor ? 0 : system.getFirstGeneral();
-    system.evaluateJacobian(q, jacobian, first);
-    matrix.factorize(jacobian, first);
-    system.multiplyOverMass(jacobian, force, appliedTerm, first);
+    auto evaluatePart = [&](const ConstraintSystem::Part& part) {
+        system.evaluateJacobian(q, jacobian, part);
+        const int failed = matrix.tryToFactorize(jacobian, part);
+        if (failed != ConstraintMatrix::REGULAR)
+            matrix.throwDependent(failed, jacobian);
+        system.multiplyOverMass(jacobian, force, appliedTerm, part);
+    };
+    if (scope == FullFactor)
+        evaluatePart(ConstraintSystem::ALL);
+    else
+        for (const ConstraintSystem::Part& part : system.getGeneralParts())
+            evaluatePart(part);
     factorScope = scope;
 }
 
@@ -224,15 +232,22 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                  lambdaRate.data(),
                                  kick};
     const vector<double>& inverseMasses = system.getInverseMasses();
-    const BatchResult pivots = runBatches(
-        false, [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.finish(arrays, begin, end); },
-        [&](int i) { velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]); });
-    if (!(pivots.extreme > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
+    const ShareResult result =
+        runShared([&](const ClusterBatch& batch, int begin, int end,
+                      ShareResult& share) { share.pivot = -larger(-share.pivot, -batch.finish(arrays, begin, end)); },
+                  [&](int i) { velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]); },
+                  [&](const ConstraintSystem::Part& part, ShareResult& share) {
+                      share.failed =
+                          std::max(share.failed, evaluateOnStepGeneral(part, arrays, positions, halfStep, forces,
+                                                                       velocities, multipliers, rightSides));
+                  });
+    if (result.failed != ConstraintMatrix::REGULAR)
+        matrix.throwDependent(result.failed, jacobianNext);
+    if (!(result.pivot > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
         // The general way knows how to name the cluster.
         system.evaluateJacobian(positions, jacobianNext);
         matrix.factorize(jacobianNext);
     }
-    evaluateOnStepGeneral(arrays, positions, halfStep, forces, velocities, multipliers, rightSides);
     monitor.setForces(forces, energy);
     if (!monitor.hasFiniteForces())
         throw StepFailure("the force on a particle is infinite or not a number");
@@ -242,41 +257,45 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
         monitor.evaluate(halfStep, lambdaHalf, rightSideHalf, valuesHalf);
 }
 
-void VRattleDynamics::evaluateOnStepGeneral(const OnStepArrays& arrays, const vector<Vec3>& positions,
-                                            const vector<Vec3>& halfStep, const vector<Vec3>& forces,
-                                            vector<Vec3>& velocities, vector<double>& multipliers,
-                                            vector<double>& rightSides) {
-    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
-    if (first == end)
-        return;
-    system.evaluateJacobian(positions, jacobianNext, first);
-    matrix.factorize(jacobianNext, first);
+// The same for one part of the clusters that are in no batch; returns what ConstraintMatrix::tryToFactorize() does.
+int VRattleDynamics::evaluateOnStepGeneral(const ConstraintSystem::Part& part, const OnStepArrays& arrays,
+                                           const vector<Vec3>& positions, const vector<Vec3>& halfStep,
+                                           const vector<Vec3>& forces, vector<Vec3>& velocities,
+                                           vector<double>& multipliers, vector<double>& rightSides) {
+    system.evaluateJacobian(positions, jacobianNext, part);
+    const int failed = matrix.tryToFactorize(jacobianNext, part);
+    if (failed != ConstraintMatrix::REGULAR)
+        return failed;
     const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i : system.getGeneralParticles())
+    const vector<int>& particles = system.getGeneralParticles();
+    for (int p = part.firstParticle; p < part.endParticle; p++) {
+        const int i = particles[p];
         velocities[i] = halfStep[i] + forces[i] * (arrays.kick * inverseMasses[i]);
-    system.multiply(jacobianNext, velocities, correction, first);
-    matrix.solve(correction, first);
-    system.addTransposedOverMass(jacobianNext, correction, -1.0, velocities, first);
-    system.multiplyOverMass(jacobianNext, forces, appliedTermNext, first);
+    }
+    system.multiply(jacobianNext, velocities, correction, part);
+    matrix.solve(correction, part);
+    system.addTransposedOverMass(jacobianNext, correction, -1.0, velocities, part);
+    system.multiplyOverMass(jacobianNext, forces, appliedTermNext, part);
     auto computeMultipliers = [&](const vector<Vec3>& at, vector<double>& right, vector<double>& result) {
-        system.evaluateCurvature(positions, at, right, first);
-        for (int k = first; k < end; k++)
+        system.evaluateCurvature(positions, at, right, part);
+        for (int k = part.first; k < part.end; k++)
             result[k] = right[k] += appliedTermNext[k];
-        matrix.solve(result, first);
+        matrix.solve(result, part);
     };
     computeMultipliers(velocities, rightSides, multipliers);
     if (arrays.lambdaHalf == nullptr)
-        return;
+        return ConstraintMatrix::REGULAR;
     computeMultipliers(halfStep, rightSideHalf, lambdaHalf);
     // Along dv = M^-1 (F - G^T Lambda), dLambda = 2 K^-1 G(v) dv.
-    for (int i : system.getGeneralParticles())
-        acceleration[i] = forces[i] * inverseMasses[i];
-    system.addTransposedOverMass(jacobianNext, multipliers, -1.0, acceleration, first);
-    system.evaluateVelocityJacobian(positions, velocities, velocityJacobian, first);
-    system.multiply(velocityJacobian, acceleration, lambdaRate, first);
-    for (int k = first; k < end; k++)
+    for (int p = part.firstParticle; p < part.endParticle; p++)
+        acceleration[particles[p]] = forces[particles[p]] * inverseMasses[particles[p]];
+    system.addTransposedOverMass(jacobianNext, multipliers, -1.0, acceleration, part);
+    system.evaluateVelocityJacobian(positions, velocities, velocityJacobian, part);
+    system.multiply(velocityJacobian, acceleration, lambdaRate, part);
+    for (int k = part.first; k < part.end; k++)
         lambdaRate[k] *= 2;
-    matrix.solve(lambdaRate, first);
+    matrix.solve(lambdaRate, part);
+    return ConstraintMatrix::REGULAR;
 }
 
 // The change of u along F - G^T Lambda, of the on-step state that is about to be taken over.
@@ -475,39 +494,48 @@ void VRattleDynamics::formHalfStepVelocities() {
 
 // ------------------------------------------------------------------------------------------ the equations of a step
 
-// Run a task on all batches, task(batch, first cluster, end, iterations), and another on all particles without constraints,
-// freeTask(particle), block by block. Each thread takes its share of the blocks. A cluster is worked on in the same lane of a pack
-// whatever the number of threads, since blocks begin at whole packs.
-template <class Task, class FreeTask>
-VRattleDynamics::BatchResult VRattleDynamics::runBatches(bool largest, const Task& task, const FreeTask& freeTask) {
+void VRattleDynamics::ShareResult::merge(const ShareResult& other) {
+    error = larger(error, other.error);
+    pivot = -larger(-pivot, -other.pivot);
+    iterations = std::max(iterations, other.iterations);
+    failed = std::max(failed, other.failed);
+}
+
+// Run a task on all batches, block by block: task(batch, first cluster, end, result); another on all particles without
+// constraints, freeTask(particle); and another on the parts of all other clusters, partTask(part, result). Each thread takes its
+// share. A cluster is worked on in the same lane of a pack whatever the number of threads, since blocks begin at whole packs.
+template <class Task, class FreeTask, class PartTask>
+VRattleDynamics::ShareResult VRattleDynamics::runShared(const Task& task, const FreeTask& freeTask,
+                                                        const PartTask& partTask) {
     const auto& batches = system.getBatches();
     const auto& blocks = system.getBlocks();
+    const auto& parts = system.getGeneralParts();
     const vector<int>& freeParticles = system.getFreeParticles();
     auto runShare = [&](int thread, int numThreads) {
-        BatchResult result = {largest ? 0.0 : std::numeric_limits<double>::infinity(), 0};
-        const size_t numBlocks = blocks.size() - 1, end = numBlocks * (thread + 1) / numThreads;
-        for (size_t b = numBlocks * thread / numThreads; b < end; b++) {
+        ShareResult result;
+        const size_t numBlocks = blocks.size() - 1, endBlock = numBlocks * (thread + 1) / numThreads;
+        for (size_t b = numBlocks * thread / numThreads; b < endBlock; b++) {
             for (size_t k = 0; k < batches.size(); k++) {
-                const int first = blocks[b].clusters[k], last = blocks[b + 1].clusters[k];
-                if (first < last) {
-                    const double number = task(*batches[k], first, last, result.iterations);
-                    result.extreme = largest ? larger(result.extreme, number) : -larger(-result.extreme, -number);
-                }
+                const int first = blocks[b].clusters[k], end = blocks[b + 1].clusters[k];
+                if (first < end)
+                    task(*batches[k], first, end, result);
             }
             for (int k = blocks[b].freeParticle; k < blocks[b + 1].freeParticle; k++)
                 freeTask(freeParticles[k]);
         }
+        const size_t endPart = parts.size() * (thread + 1) / numThreads;
+        for (size_t k = parts.size() * thread / numThreads; k < endPart; k++)
+            partTask(parts[k], result);
         return result;
     };
-    if (!parallel || system.getFirstGeneral() < MIN_PARALLEL_CONSTRAINTS)
+    const int numShared = parts.size() > 1 ? system.getNumConstraints() : system.getFirstGeneral();
+    if (!parallel || numShared < MIN_PARALLEL_CONSTRAINTS)
         return runShare(0, 1);
     const int numThreads = (int) threadResults.size();
     parallel([&](int thread) { threadResults[thread] = runShare(thread, numThreads); });
-    BatchResult result = threadResults[0];
-    for (const BatchResult& each : threadResults) {
-        result.extreme = largest ? larger(result.extreme, each.extreme) : -larger(-result.extreme, -each.extreme);
-        result.iterations = std::max(result.iterations, each.iterations);
-    }
+    ShareResult result;
+    for (const ShareResult& each : threadResults)
+        result.merge(each);
     return result;
 }
 
@@ -533,16 +561,27 @@ StepArrays VRattleDynamics::stepArrays(const vector<Vec3>& start, double kick, d
 }
 
 // acceleration = M^-1 (F - G^T lambda), w+ = start + kick acceleration (3.10), q+ = q + drift w+ (3.9)
-void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift, const vector<int>& particles,
-                                   int first) {
+void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift, const int* firstParticle,
+                                   const int* endParticle, const ConstraintSystem::Part& part) {
     const vector<double>& inverseMasses = system.getInverseMasses();
-    for (int i : particles)
-        acceleration[i] = force[i] * inverseMasses[i];
-    system.addTransposedOverMass(jacobian, lambdaNext, -1.0, acceleration, first);
-    for (int i : particles) {
-        wNext[i] = start[i] + acceleration[i] * kick;
-        qNext[i] = q[i] + wNext[i] * drift;
+    for (const int* i = firstParticle; i < endParticle; i++)
+        acceleration[*i] = force[*i] * inverseMasses[*i];
+    system.addTransposedOverMass(jacobian, lambdaNext, -1.0, acceleration, part);
+    for (const int* i = firstParticle; i < endParticle; i++) {
+        wNext[*i] = start[*i] + acceleration[*i] * kick;
+        qNext[*i] = q[*i] + wNext[*i] * drift;
     }
+}
+
+void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift) {
+    computeTrial(start, kick, drift, movingParticles.data(), movingParticles.data() + movingParticles.size(),
+                 ConstraintSystem::ALL);
+}
+
+void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift,
+                                   const ConstraintSystem::Part& part) {
+    const int* particles = system.getGeneralParticles().data();
+    computeTrial(start, kick, drift, particles + part.firstParticle, particles + part.endParticle, part);
 }
 
 void VRattleDynamics::moveFreeParticle(int i, const vector<Vec3>& start, double kick, double drift) {
@@ -553,30 +592,30 @@ void VRattleDynamics::moveFreeParticle(int i, const vector<Vec3>& start, double 
 // Solve g(q+) = 0 (3.11) for lambda, with given kick and drift, by chord iterations with A = -kick drift K(q).
 bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift, double margin) {
     startMultipliers(margin == REGULAR_MARGIN);
+    if (!system.getGeneralParts().empty())
+        ensureFactor(GeneralFactor);
     const StepArrays arrays = stepArrays(start, kick, drift);
     const double tolerance = margin * settings.tolerance;
-    BatchResult result = runBatches(
-        true,
-        [&](const ClusterBatch& batch, int begin, int end, int& iterations) {
-            return batch.solvePositions(arrays, begin, end, tolerance, iterations);
+    const ShareResult result = runShared(
+        [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
+            share.error = larger(share.error, batch.solvePositions(arrays, begin, end, tolerance, share.iterations));
         },
-        [&](int i) { moveFreeParticle(i, start, kick, drift); });
-    lastError = larger(result.extreme, solveGeneral(start, kick, drift, tolerance, result.iterations));
+        [&](int i) { moveFreeParticle(i, start, kick, drift); },
+        [&](const ConstraintSystem::Part& part, ShareResult& share) {
+            share.error = larger(share.error, solveGeneral(part, start, kick, drift, tolerance, share.iterations));
+        });
+    lastError = result.error;
     numIterations += result.iterations;
     return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
 }
 
-// The same for the clusters that are in no batch; returns the largest |g| left.
-double VRattleDynamics::solveGeneral(const vector<Vec3>& start, double kick, double drift, double tolerance,
-                                     int& iterations) {
-    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
-    if (first == end)
-        return 0;
-    ensureFactor(GeneralFactor);
+// The same for one part of the clusters that are in no batch; returns the largest |g| left.
+double VRattleDynamics::solveGeneral(const ConstraintSystem::Part& part, const vector<Vec3>& start, double kick,
+                                     double drift, double tolerance, int& iterations) {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0;; iteration++) {
-        computeTrial(start, kick, drift, system.getGeneralParticles(), first);
-        const double error = system.evaluate(qNext, residual, jacobian, first);
+        computeTrial(start, kick, drift, part);
+        const double error = system.evaluate(qNext, residual, jacobian, part);
         // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance. Where the error
         // is no longer reduced it is rounding, or Newton's to deal with.
         if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous) || iteration == MAX_CHORD_ITERATIONS)) {
@@ -584,9 +623,9 @@ double VRattleDynamics::solveGeneral(const vector<Vec3>& start, double kick, dou
             return error;
         }
         previous = error;
-        std::copy(residual.begin() + first, residual.end(), correction.begin() + first);
-        matrix.solve(correction, first);
-        for (int k = first; k < end; k++)
+        std::copy(residual.begin() + part.first, residual.begin() + part.end, correction.begin() + part.first);
+        matrix.solve(correction, part);
+        for (int k = part.first; k < part.end; k++)
             lambdaNext[k] += correction[k] / (kick * drift);
     }
 }
@@ -604,7 +643,7 @@ bool VRattleDynamics::solvePositionsByNewton(const vector<Vec3>& start, double k
 bool VRattleDynamics::iterateNewton(const vector<Vec3>& start, double kick, double drift) {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
-        computeTrial(start, kick, drift, movingParticles, 0);
+        computeTrial(start, kick, drift);
         lastError = system.evaluate(qNext, residual, jacobian);
         if (!std::isfinite(lastError))
             return false;
@@ -635,7 +674,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
         halfStepValue = evaluateU(w);
         hasHalfStepValue = true;
     }
-    if (system.getFirstGeneral() < system.getNumConstraints())
+    if (!system.getGeneralParts().empty())
         ensureFactor(GeneralFactor);
     rhoNext = StepDensity::sumUpdate(u, rho) + densityOffset;
     if (!(rhoNext > 0))
@@ -647,11 +686,15 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
         const StepArrays arrays = stepArrays(w, kick, drift);
-        const BatchResult result = runBatches(
-            true,
-            [&](const ClusterBatch& batch, int begin, int end, int&) { return batch.coupledPass(arrays, begin, end); },
-            [&](int i) { moveFreeParticle(i, w, kick, drift); });
-        lastError = larger(result.extreme, coupledPassGeneral(kick, drift));
+        lastError = runShared(
+                        [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
+                            share.error = larger(share.error, batch.coupledPass(arrays, begin, end));
+                        },
+                        [&](int i) { moveFreeParticle(i, w, kick, drift); },
+                        [&](const ConstraintSystem::Part& part, ShareResult& share) {
+                            share.error = larger(share.error, coupledPassGeneral(part, kick, drift));
+                        })
+                        .error;
         monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
         const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
@@ -669,22 +712,19 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     return TooSlow;
 }
 
-// One pass of the coupled iteration for the clusters that are in no batch; see ClusterBatch::coupledPass().
-double VRattleDynamics::coupledPassGeneral(double kick, double drift) {
-    const int first = system.getFirstGeneral(), end = system.getNumConstraints();
-    if (first == end)
-        return 0;
-    for (int k = first; k < end; k++)
+// One pass of the coupled iteration for a part of the clusters that are in no batch; see ClusterBatch::coupledPass().
+double VRattleDynamics::coupledPassGeneral(const ConstraintSystem::Part& part, double kick, double drift) {
+    for (int k = part.first; k < part.end; k++)
         lambdaNext[k] += correction[k];
-    computeTrial(w, kick, drift, system.getGeneralParticles(), first);
-    const double error = system.evaluate(qNext, residual, jacobian, first);
-    system.evaluateCurvature(q, wNext, rightSideTrial, first);
-    for (int k = first; k < end; k++) {
+    computeTrial(w, kick, drift, part);
+    const double error = system.evaluate(qNext, residual, jacobian, part);
+    system.evaluateCurvature(q, wNext, rightSideTrial, part);
+    for (int k = part.first; k < part.end; k++) {
         multiplierTrial[k] = rightSideTrial[k] += appliedTerm[k];
         correction[k] = residual[k] / (kick * drift);
     }
-    matrix.solve(multiplierTrial, first);
-    matrix.solve(correction, first);
+    matrix.solve(multiplierTrial, part);
+    matrix.solve(correction, part);
     return error;
 }
 
@@ -702,7 +742,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
-        computeTrial(w, kick, drift, movingParticles, 0);
+        computeTrial(w, kick, drift);
         lastError = system.evaluate(qNext, residual, jacobian);
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8

@@ -14,6 +14,7 @@
 #include "StepMonitor.h"
 #include "openmm/Vec3.h"
 #include <functional>
+#include <limits>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -70,7 +71,7 @@ public:
     /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
     typedef std::function<void(const std::function<void(int)>&)> Parallel;
     /**
-     * Let threads share the batches of small clusters where these are many enough to pay for it. Results do not depend on
+     * Let threads share the clusters where these are many enough to pay for it. Results do not depend on
      * the number of threads, to the last bit.
      */
     void setParallel(const Parallel& parallel, int numThreads);
@@ -220,32 +221,36 @@ private:
                         const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
                         std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
                         std::vector<double>& rightSides, std::vector<double>& monitorValues, bool withHalfStep);
-    void evaluateOnStepGeneral(const OnStepArrays& arrays, const std::vector<OpenMM::Vec3>& positions,
-                               const std::vector<OpenMM::Vec3>& halfStep, const std::vector<OpenMM::Vec3>& forces,
-                               std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
-                               std::vector<double>& rightSides);
+    int evaluateOnStepGeneral(const ConstraintSystem::Part& part, const OnStepArrays& arrays,
+                              const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
+                              const std::vector<OpenMM::Vec3>& forces, std::vector<OpenMM::Vec3>& velocities,
+                              std::vector<double>& multipliers, std::vector<double>& rightSides);
     double evaluateRate();
 
-    /** What a task on the batches gives: the extreme of its numbers over the clusters (a NaN counts), and iterations. */
-    struct BatchResult {
-        double extreme;
-        int iterations;
+    /** What tasks on clusters find: the largest error, the smallest pivot (a NaN counts), and the like. */
+    struct ShareResult {
+        double error = 0, pivot = std::numeric_limits<double>::infinity();
+        int iterations = 0, failed = ConstraintMatrix::REGULAR;
+        void merge(const ShareResult& other);
     };
-    template <class Task, class FreeTask>
-    BatchResult runBatches(bool largest, const Task& task, const FreeTask& freeTask);
+    template <class Task, class FreeTask, class PartTask>
+    ShareResult runShared(const Task& task, const FreeTask& freeTask, const PartTask& partTask);
 
     StepArrays stepArrays(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     void startMultipliers(bool withOffset);
+    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift, const int* firstParticle,
+                      const int* endParticle, const ConstraintSystem::Part& part);
+    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift,
-                      const std::vector<int>& particles, int first);
+                      const ConstraintSystem::Part& part);
     void moveFreeParticle(int i, const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double margin);
-    double solveGeneral(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double tolerance,
-                        int& iterations);
+    double solveGeneral(const ConstraintSystem::Part& part, const std::vector<OpenMM::Vec3>& start, double kick,
+                        double drift, double tolerance, int& iterations);
     bool solvePositionsByNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     bool iterateNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
     SolveResult solveCoupled();
-    double coupledPassGeneral(double kick, double drift);
+    double coupledPassGeneral(const ConstraintSystem::Part& part, double kick, double drift);
     SolveResult solveCoupledByNewton();
     double solveRegular();
     void keepOffsets();
@@ -266,7 +271,7 @@ private:
     Settings settings;
     std::vector<int> movingParticles;
     Parallel parallel; // empty: one thread
-    std::vector<BatchResult> threadResults;
+    std::vector<ShareResult> threadResults;
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
