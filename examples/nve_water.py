@@ -1,0 +1,35 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""Water at constant energy, with reports at equal times: how the energy keeps, and how the steps go.
+
+python examples/nve_water.py
+"""
+
+import openmm
+from openmm import app, unit
+from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.reporters import StepSizeReporter, run_for_time
+from openmmvrattle.testsystems import rigid_waters
+
+water = rigid_waters(32)  # a droplet of 32 rigid TIP3P molecules at 300 K
+integrator = VariableStepRattleIntegrator(1 * unit.femtosecond)
+integrator.clearMonitors()
+integrator.addMonitor(VariableStepRattleIntegrator.ConstraintAndAppliedForce)
+
+simulation = app.Simulation(water.topology, water.system, integrator, openmm.Platform.getPlatformByName("CPU"))
+simulation.context.setPositions(water.positions)
+simulation.context.setVelocities(water.velocities)
+
+# The 1 is a number of steps, of which run_for_time makes no use: it reports every 0.1 ps.
+steps = StepSizeReporter("nve_water_steps.csv", 1)
+simulation.reporters += [
+    steps,
+    app.StateDataReporter("nve_water.csv", 1, time=True, totalEnergy=True, temperature=True),
+    app.XTCReporter("nve_water.xtc", 1),  # its frames get the times 0.1, 0.2, ... ps
+]
+run_for_time(simulation, 2 * unit.picosecond, every=0.1 * unit.picosecond)
+
+print("time (ps)  step density  energy error (kJ/mol)  constraint error")
+for line in open("nve_water_steps.csv").read().splitlines()[1:]:
+    _, time, _, density, _, error, _, _, _, constraints = map(float, line.split(","))
+    print(f"{time:9.2f}  {density:12.3f}  {error:21.4f}  {constraints:16.1e}")

@@ -1,0 +1,69 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The short examples run as they stand, and show what they say. The longer ones have test files of their own."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "examples"
+
+pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="needs the folder examples")
+
+
+def run(name: str, folder: Path) -> str:
+    result = subprocess.run(
+        [sys.executable, str(FOLDER / name)], cwd=folder, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def table(path: Path) -> list[list[float]]:
+    with path.open(newline="") as file:
+        return [[float(value) for value in row] for row in list(csv.reader(file))[1:]]
+
+
+def test_quick_start(tmp_path: Path) -> None:
+    """Twenty lines; the energy stays while the steps shrink by orders of magnitude."""
+    found = re.findall(r"step (\S+) ps +energy (\S+) kJ", run("quick_start.py", tmp_path))
+    assert len(found) == 20
+    steps, energies = [float(step) for step, _ in found], [float(energy) for _, energy in found]
+    assert max(steps) / min(steps) > 100
+    assert max(energies) - min(energies) < 0.01
+
+
+def test_swap_verlet(tmp_path: Path) -> None:
+    output = run("swap_verlet.py", tmp_path)
+    steps, time = re.search(r"(\d+) steps, (\S+) ps", output).groups()
+    assert int(steps) == 2000
+    assert float(time) == pytest.approx(2.0, rel=0.02)
+    energies = [row[2] for row in table(tmp_path / "swap_verlet.csv")]
+    assert len(energies) == 20
+    assert max(energies) - min(energies) < 2.0
+
+
+def test_nve_water(tmp_path: Path) -> None:
+    lines = run("nve_water.py", tmp_path).splitlines()[1:]
+    rows = [[float(value) for value in line.split()] for line in lines]
+    assert [row[0] for row in rows] == pytest.approx([0.1 * number for number in range(1, 21)], abs=0.006)
+    assert max(abs(row[2]) for row in rows) < 1.0
+    assert max(row[3] for row in rows) < 1e-6
+    assert len(table(tmp_path / "nve_water.csv")) == 20
+    assert (tmp_path / "nve_water.xtc").stat().st_size > 0
+
+
+def test_clash_relaxation(tmp_path: Path) -> None:
+    """The energy error is much smaller with about as many force evaluations."""
+    output = run("clash_relaxation.py", tmp_path)
+    assert "Use variable steps: ForcePNorm" in output
+    found = re.findall(r"(\d+) force evaluations, .* largest energy error (\S+) kJ", output)
+    (fixed, fixed_error), (variable, variable_error) = [(int(number), float(error)) for number, error in found]
+    assert variable == pytest.approx(fixed, rel=0.2)
+    assert variable_error < fixed_error / 10
