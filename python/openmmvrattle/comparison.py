@@ -164,7 +164,8 @@ def compare(
         platform: name of the OpenMM platform.
         settings: what to run; by default the settings recommended for the system.
         progress: called while the runs go on.
-        integrators: names out of `openmmvrattle.measurement.INTEGRATORS`; by default all of them.
+        integrators: names out of `openmmvrattle.measurement.INTEGRATORS`; by default those of
+            `DEFAULT_INTEGRATORS` there.
         wanted_error: kJ/mol; if given, the number of force evaluations is searched that each integrator needs for it,
             instead of giving all of them the same number.
     """
@@ -187,7 +188,7 @@ class Case:
     settings: ComparisonSettings
     platform: str = "Reference"
     integrators: tuple[str, ...] = ()
-    """Names out of `openmmvrattle.measurement.INTEGRATORS`; none for all."""
+    """Names out of `openmmvrattle.measurement.INTEGRATORS`; none for the default ones."""
     wanted_error: float | None = None
     """In kJ/mol; if given, compare at this accuracy instead of at equal force evaluations."""
     most_evaluations: int | None = None

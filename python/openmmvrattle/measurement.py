@@ -18,11 +18,12 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
 
 from .testsystems import ComparisonSettings, StepControl, TestSystem, constraint_error
 
 __all__ = [
+    "DEFAULT_INTEGRATORS",
     "INTEGRATORS",
     "IntegratorRun",
     "Method",
@@ -162,16 +163,32 @@ def _vrattle(settings: ComparisonSettings) -> list[Method]:
     ]
 
 
+def _custom(settings: ComparisonSettings) -> list[Method]:
+    methods = []
+    for method, control in zip(_vrattle(settings), settings.controls, strict=True):
+        name = method.name.replace("VRATTLE", "VRATTLE (custom)")
+        of_constraints = any(monitor.kind.startswith("Constraint") for monitor in control.monitors)
+        if of_constraints and control.update_method == "Explicit":  # which the class does not have for them
+            control = replace(control, update_method="SemiExplicit")
+            name = f"{name.removesuffix(', Explicit')}, SemiExplicit"
+        make = functools.partial(make_integrator, control, kind=CustomVariableStepRattleIntegrator)
+        methods.append(replace(method, name=name, make=make, update_method=control.update_method))
+    return methods
+
+
 INTEGRATORS: dict[str, Callable[[ComparisonSettings], list[Method]]] = {
     "VerletIntegrator": _verlet,
     "VariableVerletIntegrator": _variable_verlet,
     "RATTLE": _rattle,
     "VRATTLE": _vrattle,
     "Automatic": _automatic,
+    "CustomVRATTLE": _custom,
 }
 """What can be compared, by name; each value gives the methods to run for the settings. ``RATTLE`` is our integrator
 without a monitor, which has fixed steps; ``VRATTLE`` is the same with each of the step controls of the settings, and
-``Automatic`` with the automatic step control."""
+``Automatic`` with the automatic step control. ``CustomVRATTLE`` is CustomVariableStepRattleIntegrator."""
+DEFAULT_INTEGRATORS = ("VerletIntegrator", "VariableVerletIntegrator", "RATTLE", "VRATTLE", "Automatic")
+"""What is compared if nothing is said."""
 
 
 def methods_of(settings: ComparisonSettings, integrators: Iterable[str] | None = None) -> list[Method]:
@@ -179,9 +196,9 @@ def methods_of(settings: ComparisonSettings, integrators: Iterable[str] | None =
 
     Args:
         settings: total time, force evaluations and step controls.
-        integrators: names out of `INTEGRATORS`; by default all of them.
+        integrators: names out of `INTEGRATORS`; by default `DEFAULT_INTEGRATORS`.
     """
-    return [method for name in integrators or INTEGRATORS for method in INTEGRATORS[name](settings)]
+    return [method for name in integrators or DEFAULT_INTEGRATORS for method in INTEGRATORS[name](settings)]
 
 
 def _mean_step(settings: ComparisonSettings) -> float:
@@ -204,15 +221,18 @@ def _bounds_of(control: StepControl) -> str:
     return f"bounds {control.smallest_step_ratio:.3g} and {control.largest_step_ratio:.3g}"
 
 
-def make_integrator(control: StepControl, nominal_step_size: float | None = None) -> VariableStepRattleIntegrator:
+def make_integrator(
+    control: StepControl, nominal_step_size: float | None = None, kind: type = VariableStepRattleIntegrator
+) -> Any:
     """A VariableStepRattleIntegrator with the settings of a step control.
 
     Args:
         control: monitors, bounds and update of the step density.
         nominal_step_size: ps; by default that of the control. The bounds keep their ratio to it.
+        kind: CustomVariableStepRattleIntegrator for one of that class.
     """
     nominal = control.nominal_step_size if nominal_step_size is None else nominal_step_size
-    integrator = VariableStepRattleIntegrator(nominal)
+    integrator = kind(nominal)
     if control.automatic_trial_steps:
         integrator.useAutomaticStepControl(control.automatic_trial_steps)
         return integrator

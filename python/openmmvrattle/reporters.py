@@ -33,26 +33,11 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
-from . import VariableStepRattleIntegrator
+import openmmvrattle
+
+from .custom_settings import MONITOR_KINDS
 
 __all__ = ["StepSizeReporter", "run_for_time"]
-
-_MONITOR_NAMES = {
-    getattr(VariableStepRattleIntegrator, name): name
-    for name in (
-        "ConstraintMultipliers",
-        "ConstraintForce",
-        "AppliedForce",
-        "ConstraintAndAppliedForce",
-        "MultiplierPNorm",
-        "ForcePNorm",
-        "VectorField",
-        "MaxForce",
-        "ArcLength",
-        "MaxParticleArcLength",
-        "ForceGroupEnergy",
-    )
-}
 
 
 class StepSizeReporter:
@@ -385,8 +370,9 @@ def _integrator_of(simulation: app.Simulation) -> Any:
     integrator = simulation.integrator
     if isinstance(integrator, openmm.CompoundIntegrator):
         integrator = integrator.getIntegrator(integrator.getCurrentIntegrator())
-        if VariableStepRattleIntegrator.isinstance(integrator):
-            integrator = VariableStepRattleIntegrator.cast(integrator)
+        for name in ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator"):
+            if name in openmmvrattle.__all__ and getattr(openmmvrattle, name).isinstance(integrator):
+                integrator = getattr(openmmvrattle, name).cast(integrator)
     return integrator
 
 
@@ -396,7 +382,7 @@ def _monitor_values(integrator: Any) -> dict[str, float | None]:
     values: dict[str, float | None] = {}
     for index in range(integrator.getNumMonitors()):
         kind = integrator.getMonitor(index)[0]
-        name = f"Monitor {_MONITOR_NAMES.get(kind, kind)}"
+        name = f"Monitor {MONITOR_KINDS[kind]}"
         while name in values:
             name += " again"
         values[name] = float(integrator.getMonitorValue(index))

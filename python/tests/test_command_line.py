@@ -385,6 +385,19 @@ def test_info_says_what_is_wrong(monkeypatch, capsys) -> None:
     assert "Something is wrong" in output
 
 
+def test_info_where_the_compiled_part_cannot_be_loaded() -> None:
+    """The command works, says why, and what can be used all the same."""
+    script = (
+        "import sys; sys.modules['openmmvrattle._vrattle'] = None; "
+        "from openmmvrattle.__main__ import main; main(['info'])"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "Something is wrong" in result.stdout
+    assert "the compiled part of openmmvrattle cannot be used" in result.stdout
+    assert "yes" in result.stdout  # the integrator in Python alone
+
+
 def test_info_tries_the_integrators(monkeypatch, capsys) -> None:
     """A platform on which a step fails is named, with the reason."""
 

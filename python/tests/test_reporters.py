@@ -15,7 +15,7 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
 from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain, rigid_waters
 
@@ -217,6 +217,17 @@ def test_integrators_of_openmm_have_fewer_columns() -> None:
         "Constraint Error",
     ]
     assert reporter.rows[0]["Step Size (ps)"] == 0.001
+
+
+def test_the_custom_integrator_has_all_columns() -> None:
+    integrator = CustomVariableStepRattleIntegrator(0.001)
+    simulation = make_simulation(integrator)
+    reporter = StepSizeReporter(None, 4)
+    simulation.reporters.append(reporter)
+    simulation.step(8)
+    assert set(reporter.rows[0]) == set(HEADINGS) - {"Monitor ForcePNorm"}
+    run_for_time(simulation, 0.02, every=0.01)
+    assert reporter.rows[-1]["Time (ps)"] - reporter.rows[-2]["Time (ps)"] == pytest.approx(0.01, rel=1e-9)
 
 
 def test_integrator_inside_a_compound_one() -> None:

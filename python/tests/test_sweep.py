@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
@@ -38,6 +39,7 @@ from openmmvrattle.testsystems import (
     rigid_waters,
     water_clash,
 )
+from rich.console import Console
 
 
 def small_case(label="clash", **changes):
@@ -80,6 +82,36 @@ def test_runs_have_names_of_their_own():
     assert len(set(names)) == len(names) == 9
     assert names[-2:] == ["VRATTLE, MaxForce", "VRATTLE, automatic"]
     assert "VRATTLE, ForcePNorm, Explicit" in names
+
+
+def test_the_custom_integrator_can_be_compared():
+    """With the monitors that it has it gives nearly the same energies; what it lacks is a failed run."""
+    waters = rigid_waters(2)
+    controls = tuple(
+        StepControl((MonitorSettings(kind),), 1e-3, update_method="Explicit")
+        for kind in ("ForcePNorm", "ConstraintForce")
+    )
+    controls += (StepControl((MonitorSettings("MaxForce"),), 1e-3),)
+    settings = ComparisonSettings(0.2, 200, controls)
+    runs = {run.name: run for run in compare(waters, settings=settings, integrators=["VRATTLE", "CustomVRATTLE"]).runs}
+    for name, custom in (
+        ("VRATTLE, ForcePNorm", "VRATTLE (custom), ForcePNorm"),
+        ("VRATTLE, ConstraintForce", "VRATTLE (custom), ConstraintForce, SemiExplicit"),
+    ):
+        assert runs[custom].failure is None
+        assert runs[custom].largest_energy_error == pytest.approx(runs[name].largest_energy_error, rel=0.1)
+    assert "MaxForce" in runs["VRATTLE (custom), MaxForce"].failure
+
+
+def test_a_long_name_does_not_cut_a_column(clash_result):
+    from openmmvrattle.commands.compare import print_comparison
+
+    run = replace(
+        clash_result.runs[0], name="an integrator with a name that goes on and on and on", failure="it failed"
+    )
+    console = Console(width=160, file=io.StringIO())
+    print_comparison(console, replace(clash_result, runs=(run, *clash_result.runs[1:])))
+    assert "…" not in console.file.getvalue()
 
 
 def test_reference_values_are_set():

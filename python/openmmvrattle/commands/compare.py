@@ -85,7 +85,8 @@ def add_parser(commands: Any) -> None:
         nargs="+",
         metavar="NAME",
         help="VerletIntegrator, VariableVerletIntegrator, RATTLE (fixed steps), VRATTLE (with monitors), Automatic "
-        "(VRATTLE with automatic step control); default: all",
+        "(VRATTLE with automatic step control), CustomVRATTLE (the class in Python alone, for every platform); "
+        "default: all but the last",
     )
     what.add_argument(
         "--monitors",
@@ -397,9 +398,9 @@ def print_comparison(console: Any, comparison: Comparison) -> None:
     measures = [measures_of(run) for run in comparison.runs]
     styles = [_style_of(run, comparison) for run in comparison.runs]
     if console.width >= _WIDTH_OF_TABLE:
-        table.add_column("integrator", no_wrap=True)
+        table.add_column("integrator", overflow="fold")
         for heading in measures[0]:
-            table.add_column(heading, justify="right")
+            table.add_column(heading, justify="right", no_wrap=True)
         for name, values, style in zip(names, measures, styles, strict=True):
             table.add_row(name, *values.values(), style=style)
     else:

@@ -68,7 +68,7 @@ def information() -> dict[str, Any]:
 def _versions() -> dict[str, str]:
     versions = {
         "openmm-vrattle": openmmvrattle.__version__,
-        "built for OpenMM": openmmvrattle._build.OPENMM_VERSION,
+        "built for OpenMM": _built_for(),
         "OpenMM": openmm.Platform.getOpenMMVersion(),
         "Python": platform.python_version(),
         "SWIG runtime": _swig_runtime(),
@@ -82,6 +82,14 @@ def _versions() -> dict[str, str]:
     return versions
 
 
+def _built_for() -> str:
+    try:
+        from .. import _build
+    except ImportError:
+        return "nothing was built"
+    return _build.OPENMM_VERSION
+
+
 def _swig_runtime() -> str:
     """The SWIG runtimes in use: OpenMM's wrapper and ours understand each other if there is only one."""
     found = sorted(re.findall(r"swig_runtime_data(\d+)", " ".join(sys.modules)))
@@ -90,11 +98,12 @@ def _swig_runtime() -> str:
 
 def _integrators() -> dict[str, Callable[[], openmm.Integrator]]:
     """What can be tried on a platform."""
-    return {
-        name: functools.partial(getattr(openmmvrattle, name), 0.001)
-        for name in ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator")
-        if hasattr(openmmvrattle, name)
-    }
+
+    def make(name: str) -> openmm.Integrator:
+        return getattr(openmmvrattle, name)(0.001)
+
+    names = ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator")
+    return {name: functools.partial(make, name) for name in names}
 
 
 def _problem(make: Callable[[], openmm.Integrator], on: openmm.Platform) -> str | None:

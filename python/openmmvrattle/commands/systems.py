@@ -14,23 +14,10 @@ from pathlib import Path
 
 import openmm
 
+from ..custom_settings import MONITOR_KINDS as MONITORS
 from ..inputs import CONSTRAINTS, DEFAULT_FORCE_FIELD, InputError, from_pdb, from_xml
 from ..testsystems import SYSTEMS, MonitorSettings, TestSystem
 
-MONITORS = (
-    "ConstraintMultipliers",
-    "ConstraintForce",
-    "AppliedForce",
-    "ConstraintAndAppliedForce",
-    "MultiplierPNorm",
-    "ForcePNorm",
-    "VectorField",
-    "MaxForce",
-    "ArcLength",
-    "MaxParticleArcLength",
-    "ForceGroupEnergy",
-)
-"""The kinds of monitor of the integrator."""
 UPDATES = ("SemiExplicit", "Explicit", "Bounded")
 """The recursions of the step density."""
 _LARGE = 500
