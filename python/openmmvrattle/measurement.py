@@ -461,7 +461,7 @@ def _measure(
     energy_interval = math.ceil(evaluations / MAXIMUM_ENERGY_SAMPLES)
     constraint_interval = math.ceil(evaluations / MAXIMUM_CONSTRAINT_SAMPLES)
     end, limit = _end_of(settings), most_steps or 2 * evaluations
-    energy_at_start = _energy(context)
+    energy_at_start = _energy(test_system, context)
     times, errors, sizes = [0.0], [0.0], [math.nan]
     simulated, steps, seconds, largest_constraint_error = 0.0, 0, 0.0, 0.0
     smallest, largest = math.inf, 0.0
@@ -477,7 +477,7 @@ def _measure(
             last = simulated >= end
             if steps % energy_interval == 0 or last:
                 times.append(simulated)
-                errors.append(_checked_energy(context, simulated) - energy_at_start)
+                errors.append(_checked_energy(test_system, context, simulated) - energy_at_start)
                 sizes.append(size)
             if steps % constraint_interval == 0 or last:
                 largest_constraint_error = max(largest_constraint_error, _constraint_error(test_system, context))
@@ -545,6 +545,7 @@ def _start(
     try:
         integrator = method.make(parameter)
         integrator.setConstraintTolerance(settings.constraint_tolerance)
+        test_system.prepare(integrator)
         context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName(platform))
         for name, value in test_system.parameters:
             context.setParameter(name, value)
@@ -566,7 +567,7 @@ def _half_step_back(test_system: TestSystem, context: openmm.Context, step: floa
     The constraint forces can be left out: they change the velocities only along the directions that the first step
     removes anyway.
     """
-    forces = context.getState(getForces=True).getForces(asNumpy=True)
+    forces = context.getState(getForces=True, groups=test_system.force_groups).getForces(asNumpy=True)
     forces = forces.value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
     system = test_system.system
     masses = np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
@@ -592,9 +593,9 @@ def _checked_step(integrator: Any, simulated: float) -> float:
     return size
 
 
-def _checked_energy(context: openmm.Context, simulated: float) -> float:
+def _checked_energy(test_system: TestSystem, context: openmm.Context, simulated: float) -> float:
     try:
-        energy = _energy(context)
+        energy = _energy(test_system, context)
     except Exception as error:
         raise _RunError(f"at {simulated:.4g} ps: {_sentence(error)}") from error
     if not math.isfinite(energy):
@@ -602,9 +603,9 @@ def _checked_energy(context: openmm.Context, simulated: float) -> float:
     return energy
 
 
-def _energy(context: openmm.Context) -> float:
+def _energy(test_system: TestSystem, context: openmm.Context) -> float:
     """Kinetic plus potential energy at the time of the positions, in kJ/mol."""
-    state = context.getState(getEnergy=True)
+    state = context.getState(getEnergy=True, groups=test_system.force_groups)
     return state.getKineticEnergy()._value + state.getPotentialEnergy()._value
 
 
@@ -623,7 +624,8 @@ def initial_energy(test_system: TestSystem, platform: str) -> float:
     system = test_system.system
     masses = np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
     kinetic = 0.5 * float(np.sum(masses[:, None] * test_system.velocities**2))
-    return kinetic + context.getState(getEnergy=True).getPotentialEnergy()._value
+    state = context.getState(getEnergy=True, groups=test_system.force_groups)
+    return kinetic + state.getPotentialEnergy()._value
 
 
 def _end_of(settings: ComparisonSettings) -> float:

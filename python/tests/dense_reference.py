@@ -60,8 +60,12 @@ class DenseConstraints:
     def g(self, q: Array) -> Array:
         return np.sum(self.separations(q) ** 2, axis=1) - self.lengths**2
 
+    def half_derivative_of_second(self, v: Array) -> Array:
+        """Half the derivative of g''(v,v) with respect to v; for distances it is G with v in place of q."""
+        return self.jacobian(v)
+
     def jacobian(self, q: Array) -> Array:
-        """G = dg/dq; with v in place of q it is G(v), which is half the derivative of g''(v,v) with respect to v."""
+        """G = dg/dq."""
         r = self.separations(q)
         return 2 * np.einsum("ka,kan->kn", r, self.difference.reshape(len(self.pairs), 3, -1))
 
@@ -110,8 +114,8 @@ def monitor(
     if kind in ("ConstraintMultipliers", "ConstraintForce", "ConstraintAndAppliedForce", "MultiplierPNorm"):
         lam = c.multipliers(q, p, gradient)
         k = c.matrix(q)
-        # dLambda/dp = 2 K^-1 G(v) M^-1; transposed and applied to x:
-        back = 2 * c.w3[:, None] * c.jacobian(v).T
+        # dLambda/dp = K^-1 d(g''(v,v))/dv M^-1; transposed and applied to x:
+        back = 2 * c.w3[:, None] * c.half_derivative_of_second(v).T
         if kind == "ConstraintMultipliers":
             u = float(np.linalg.norm(lam))
             return u, back @ np.linalg.solve(k, lam) / u
