@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -367,3 +369,34 @@ def test_comparison_of_the_rod() -> None:
     variable = runs["VRATTLE, ForceGroupEnergy^0.125"]
     assert variable.failure is None and variable.force_evaluations == pytest.approx(350, rel=0.02)
     assert comparison.gain(variable) == pytest.approx(7.9, rel=0.2)
+
+
+BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "rod.py"
+
+
+def run_benchmark(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(BENCHMARK), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.skipif(not BENCHMARK.exists(), reason="needs the folder benchmarks")
+def test_benchmark() -> None:
+    """A line for each length, in rising order, and a table; what it measures hangs together."""
+    result = run_benchmark("--sections", "40", "10", "--repeats", "2")
+    assert result.returncode == 0, result.stderr
+    lines = [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
+    assert [line["sections"] for line in lines] == [10, 40]
+    for line in lines:
+        assert line["constraints"] == 6 * (line["sections"] - 1)
+        assert 0 < line["no_forces_seconds"] < line["whole_seconds"]
+        assert line["whole_microseconds_per_section"] == pytest.approx(1e6 * line["whole_seconds"] / line["sections"])
+        assert 1 <= line["iterations_per_step"] < 5
+    assert lines[0]["whole_relative"] == 1.0
+    assert "A step of an elastic rod" in result.stdout
+
+
+@pytest.mark.skipif(not BENCHMARK.exists(), reason="needs the folder benchmarks")
+@pytest.mark.parametrize("arguments", [["--sections", "1"], ["--repeats", "0"]])
+def test_benchmark_of_nothing(arguments: list[str]) -> None:
+    result = run_benchmark(*arguments)
+    assert result.returncode == 2 and "at least" in result.stderr
