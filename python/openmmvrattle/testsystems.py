@@ -147,7 +147,7 @@ class TestSystem:
 
     @property
     def force_groups(self) -> int:
-        """The force groups that act in the system, as the bits of a number: all but that of the monitor."""
+        """The force groups that act in the system, all but that of the monitor, as the bits of a number."""
         everything = 0xFFFFFFFF
         return everything if self.monitor_force_group is None else everything & ~(1 << self.monitor_force_group)
 
