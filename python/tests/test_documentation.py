@@ -144,6 +144,13 @@ def test_the_docstring_of_a_method_says_what_it_takes_returns_and_raises(name: s
         assert not returns
 
 
+def test_every_example_is_listed() -> None:
+    page = (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
+    examples = [path for path in ROOT.glob("examples/**/*.*") if path.suffix in {".py", ".ipynb", ".cpp"}]
+    assert len(examples) > 5
+    assert not [path.name for path in examples if f"](../{path.relative_to(ROOT).as_posix()})" not in page]
+
+
 @pytest.mark.parametrize("picture", sorted(ROOT.glob("docs/images/*.png")), ids=name_of)
 def test_a_picture_is_small_and_shown(picture: Path) -> None:
     assert picture.stat().st_size < 200_000
