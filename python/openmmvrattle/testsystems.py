@@ -34,12 +34,20 @@ __all__ = [
     "StepControl",
     "TestSystem",
     "alanine_dipeptide",
+    "argon_cluster",
+    "colliding_water_clusters",
     "constraint_error",
     "diatomic_on_wall",
     "double_pendulum",
     "elastic_rod",
+    "flexible_waters",
+    "independent_whips",
+    "ion_pair",
     "light_heavy_chain",
+    "long_light_heavy_chain",
     "nitrogen_collision",
+    "peptide_in_water",
+    "polymer",
     "project_onto_constraints",
     "rigid_waters",
     "water_clash",
@@ -64,7 +72,7 @@ class StepControl:
     """
 
     monitors: tuple[MonitorSettings, ...]
-    """The monitors; none gives fixed steps."""
+    """The monitors; none gives fixed steps, or automatic ones."""
     nominal_step_size: float
     """The step where the monitor has its reference value, in ps; a first guess where the steps are counted."""
     smallest_step_ratio: float = 1 / 50
@@ -543,7 +551,7 @@ def diatomic_on_wall(speed: float = 2.0) -> TestSystem:
     half = 0.5 * _NITROGEN_BOND
     topology = _chain_topology(("N1", "N2"), (app.element.nitrogen, app.element.nitrogen))
     return TestSystem(
-        name="diatomic-on-wall",
+        name="diatomic-on-wall" if speed == 2.0 else f"diatomic-on-wall-{speed:g}",
         system=system,
         topology=topology,
         positions=np.array([centre - half * axis, centre + half * axis]),
@@ -760,6 +768,287 @@ _MOLECULAR_CONTROLS = (
     StepControl(monitors=(MonitorSettings("ConstraintAndAppliedForce"),), nominal_step_size=1e-3),
 )
 
+_FORCE_CONTROL = (StepControl(monitors=(MonitorSettings("ConstraintAndAppliedForce"),), nominal_step_size=1e-3),)
+_BOLTZMANN = 0.00831446261815324  # kJ/mol/K
+
+
+def _thermal_velocities(
+    system: openmm.System, positions: np.ndarray, temperature: float, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions on the constraints, and velocities of the Maxwell-Boltzmann distribution that are tangent to them."""
+    masses = np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
+    # Drawn for free particles and projected in the mass metric, they have the distribution of the constrained ones.
+    velocities = random.standard_normal(positions.shape) * np.sqrt(_BOLTZMANN * temperature / masses)[:, None]
+    return project_onto_constraints(system, positions, velocities)
+
+
+def long_light_heavy_chain(atoms: int = 8, temperature: float = 300.0, seed: int = 1) -> TestSystem:
+    """A chain of iodine and hydrogen by turns with rigid bonds and no other force, in thermal motion.
+
+    Every hydrogen atom is a joint that whips when its two neighbours pull it straight.
+
+    Args:
+        atoms: their number.
+        temperature: temperature in K.
+        seed: seed of the start.
+    """
+    random = np.random.default_rng(seed)
+    system = openmm.System()
+    for atom in range(atoms):
+        system.addParticle(126.9 if atom % 2 == 0 else 1.008)
+    length = 0.1609  # nm, the bond of HI
+    positions = [np.zeros(3)]
+    for atom in range(1, atoms):
+        system.addConstraint(atom - 1, atom, length)
+        turn = math.radians(40.0) * (-1) ** atom + random.normal(0.0, 0.2)
+        axis = np.array([math.cos(turn), math.sin(turn), random.normal(0.0, 0.2)])
+        positions.append(positions[-1] + length * axis / np.linalg.norm(axis))
+    positions, velocities = _thermal_velocities(system, np.array(positions), temperature, random)
+    elements = tuple(app.element.iodine if i % 2 == 0 else app.element.hydrogen for i in range(atoms))
+    return TestSystem(
+        name="long-light-heavy-chain",
+        system=system,
+        topology=_chain_topology(tuple(f"A{i}" for i in range(atoms)), elements),
+        positions=positions,
+        velocities=velocities,
+        description=f"chain of {atoms} I and H by turns, rigid bonds, {temperature:g} K",
+        settings=ComparisonSettings(total_time=10.0, force_evaluations=8000, controls=_FORCE_CONTROL),
+    )
+
+
+def independent_whips(molecules: int = 64, temperature: float = 300.0, seed: int = 1) -> TestSystem:
+    """Many I-CH2-I with rigid bonds and no angle term that do not see each other.
+
+    One of them is always in a whip, so a step that is the same for all has little to gain.
+
+    Args:
+        molecules: their number.
+        temperature: temperature in K.
+        seed: seed of the start.
+    """
+    random = np.random.default_rng(seed)
+    system = openmm.System()
+    length = 0.2132  # nm, the bond of CH2I2
+    positions = []
+    topology = app.Topology()
+    chain = topology.addChain()
+    for molecule in range(molecules):
+        middle = np.array([molecule % 8, molecule // 8 % 8, molecule // 64], dtype=float)
+        axes = random.standard_normal((2, 3))
+        ends = middle + length * axes / np.linalg.norm(axes, axis=1)[:, None]
+        positions += [ends[0], middle, ends[1]]
+        residue = topology.addResidue("CH2", chain)
+        for name, mass, element in (
+            ("I1", 126.9, app.element.iodine),
+            ("C", 14.027, app.element.carbon),
+            ("I2", 126.9, app.element.iodine),
+        ):
+            system.addParticle(mass)
+            topology.addAtom(name, element, residue)
+        system.addConstraint(3 * molecule, 3 * molecule + 1, length)
+        system.addConstraint(3 * molecule + 1, 3 * molecule + 2, length)
+    positions, velocities = _thermal_velocities(system, np.array(positions), temperature, random)
+    return TestSystem(
+        name="independent-whips",
+        system=system,
+        topology=topology,
+        positions=positions,
+        velocities=velocities,
+        description=f"{molecules} I-CH2-I with rigid bonds that do not see each other, {temperature:g} K",
+        settings=ComparisonSettings(total_time=5.0, force_evaluations=2000, controls=_FORCE_CONTROL),
+    )
+
+
+def ion_pair() -> TestSystem:
+    """A sodium and a chloride ion that fall towards each other and bounce off, again and again; no constraint."""
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    # Diameters and depths of Joung and Cheatham for SPC/E.
+    for mass, charge, diameter, depth in ((22.99, 1.0, 0.2160, 1.4754), (35.45, -1.0, 0.4830, 0.0535)):
+        system.addParticle(mass)
+        force.addParticle(charge, diameter, depth)
+    system.addForce(force)
+    return TestSystem(
+        name="ion-pair",
+        system=system,
+        topology=_chain_topology(("NA", "CL"), (app.element.sodium, app.element.chlorine)),
+        positions=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        velocities=np.array([[0.0, -0.3, 0.0], [0.0, 0.3 * 22.99 / 35.45, 0.0]]),
+        description="Na+ and Cl- that fall towards each other",
+        settings=ComparisonSettings(total_time=3.0, force_evaluations=2000, controls=_FORCE_CONTROL),
+    )
+
+
+def colliding_water_clusters(speed: float = 3.0, seed: int = 1) -> TestSystem:
+    """Two clusters of four rigid waters that collide.
+
+    Args:
+        speed: their relative speed in nm/ps, which is km/s.
+        seed: seed of the equilibration of both.
+    """
+    left, right = rigid_waters(4, 150.0, 2 * seed), rigid_waters(4, 150.0, 2 * seed + 1)
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    for half in (left, right):
+        first = system.getNumParticles()
+        source = next(f for f in half.system.getForces() if isinstance(f, openmm.NonbondedForce))
+        for i in range(half.system.getNumParticles()):
+            system.addParticle(half.system.getParticleMass(i))
+            force.addParticle(*source.getParticleParameters(i))
+        for k in range(half.system.getNumConstraints()):
+            i, j, distance = half.system.getConstraintParameters(k)
+            system.addConstraint(first + i, first + j, distance)
+            force.addException(first + i, first + j, 0.0, 1.0, 0.0)
+    system.addForce(force)
+    away = np.array([0.7, 0.0, 0.0])
+    motion = np.array([0.5 * speed, 0.0, 0.0])
+    topology = app.Topology()
+    chain = topology.addChain()
+    for _ in range(8):
+        residue = topology.addResidue("HOH", chain)
+        for name in ("O", "H1", "H2"):
+            topology.addAtom(name, app.Element.getBySymbol(name[0]), residue)
+    return TestSystem(
+        name="colliding-water-clusters",
+        system=system,
+        topology=topology,
+        positions=np.concatenate([left.positions - away, right.positions + away]),
+        velocities=np.concatenate([left.velocities + motion, right.velocities - motion]),
+        description=f"two clusters of four rigid waters that collide at {speed:g} km/s",
+        settings=ComparisonSettings(total_time=1.0, force_evaluations=2000, controls=_FORCE_CONTROL),
+    )
+
+
+def peptide_in_water(waters: int = 40, temperature: float = 300.0, seed: int = 1) -> TestSystem:
+    """Alanine dipeptide in a droplet of rigid water, with the force fields amber14 and TIP3P.
+
+    Args:
+        waters: the number of water molecules.
+        temperature: temperature in K.
+        seed: seed of the equilibration.
+    """
+    peptide = alanine_dipeptide(temperature=temperature, seed=seed)
+    modeller = app.Modeller(peptide.topology, peptide.positions * unit.nanometer)
+    force_field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    modeller.addSolvent(force_field, numAdded=3 * waters)
+    places = np.array(modeller.positions.value_in_unit(unit.nanometer))
+    atoms = [[atom.index for atom in residue.atoms()] for residue in modeller.topology.residues()]
+    solvent = [residue for residue in modeller.topology.residues() if residue.name == "HOH"]
+    centre = places[: peptide.topology.getNumAtoms()]
+    near = sorted(solvent, key=lambda residue: np.linalg.norm(centre - places[atoms[residue.index][0]], axis=1).min())
+    modeller.delete(near[waters:])
+    system = force_field.createSystem(
+        modeller.topology, nonbondedMethod=app.NoCutoff, constraints=app.HBonds, removeCMMotion=False
+    )
+    positions, velocities = _equilibrated(
+        system, np.array(modeller.positions.value_in_unit(unit.nanometer)), temperature, seed, 500, 0.001, 100.0
+    )
+    return TestSystem(
+        name="peptide-in-water",
+        system=system,
+        topology=modeller.topology,
+        positions=positions,
+        velocities=velocities,
+        description=f"alanine dipeptide in a droplet of {waters} rigid TIP3P waters, {temperature:g} K",
+        settings=ComparisonSettings(total_time=0.5, force_evaluations=500, controls=_FORCE_CONTROL),
+    )
+
+
+def polymer(beads: int = 30, temperature: float = 300.0, seed: int = 1) -> TestSystem:
+    """A chain of CH2 groups as single particles, with rigid bonds, stiff angles and Lennard-Jones: polyethylene.
+
+    Args:
+        beads: the number of groups.
+        temperature: temperature in K.
+        seed: seed of the start and the equilibration.
+    """
+    random = np.random.default_rng(seed)
+    system = openmm.System()
+    angle, torsion, contact = openmm.HarmonicAngleForce(), openmm.RBTorsionForce(), openmm.NonbondedForce()
+    length, opening = 0.153, math.radians(114.0)
+    positions = []
+    for i in range(beads):
+        system.addParticle(14.027)
+        contact.addParticle(0.0, 0.395, 0.382)
+        half = 0.5 * (math.pi - opening)
+        positions.append([i * length * math.cos(half), (i % 2) * length * math.sin(half), 0.0])
+        if i > 0:
+            system.addConstraint(i - 1, i, length)
+        if i > 1:
+            angle.addAngle(i - 2, i - 1, i, opening, 519.6)
+        if i > 2:
+            torsion.addTorsion(i - 3, i - 2, i - 1, i, 8.397, 16.786, 1.134, -26.318, 0.0, 0.0)
+    contact.createExceptionsFromBonds([(i - 1, i) for i in range(1, beads)], 0.0, 0.0)
+    for force in (angle, torsion, contact):
+        system.addForce(force)
+    start = np.array(positions) + random.normal(0.0, 1e-3, (beads, 3))
+    start, velocities = _equilibrated(system, start, temperature, seed)
+    return TestSystem(
+        name="polymer",
+        system=system,
+        topology=_chain_topology(tuple(f"C{i}" for i in range(beads)), (app.element.carbon,) * beads),
+        positions=start,
+        velocities=velocities,
+        description=f"chain of {beads} CH2 with rigid bonds, {temperature:g} K",
+        settings=ComparisonSettings(total_time=2.0, force_evaluations=1000, controls=_FORCE_CONTROL),
+    )
+
+
+def argon_cluster(atoms: int = 55, temperature: float = 40.0, seed: int = 1) -> TestSystem:
+    """A liquid droplet of argon: soft forces only, and no constraint.
+
+    Args:
+        atoms: their number.
+        temperature: temperature in K.
+        seed: seed of the equilibration.
+    """
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    grid = np.array(list(itertools.product(range(-3, 4), repeat=3)), dtype=float)
+    places = 0.38 * grid[np.argsort(np.sum(grid**2, axis=1), kind="stable")[:atoms]]
+    topology = app.Topology()
+    chain = topology.addChain()
+    for _ in range(atoms):
+        system.addParticle(39.95)
+        force.addParticle(0.0, 0.34, 0.996)
+        topology.addAtom("AR", app.element.argon, topology.addResidue("AR", chain))
+    system.addForce(force)
+    positions, velocities = _equilibrated(system, places, temperature, seed)
+    return TestSystem(
+        name="argon-cluster",
+        system=system,
+        topology=topology,
+        positions=positions,
+        velocities=velocities,
+        description=f"droplet of {atoms} argon atoms, {temperature:g} K",
+        settings=ComparisonSettings(total_time=20.0, force_evaluations=1000, controls=_FORCE_CONTROL),
+    )
+
+
+def flexible_waters(n: int = 8, temperature: float = 300.0, seed: int = 1) -> TestSystem:
+    """A cluster of water molecules with harmonic bonds and angles, so that no distance is constrained.
+
+    Args:
+        n: number of molecules.
+        temperature: temperature in K.
+        seed: seed of the equilibration.
+    """
+    rigid = rigid_waters(n, temperature, seed)
+    system = app.ForceField("tip3p.xml").createSystem(
+        rigid.topology, nonbondedMethod=app.NoCutoff, rigidWater=False, flexibleConstraints=False, removeCMMotion=False
+    )
+    positions, velocities = _equilibrated(system, rigid.positions, temperature, seed, step=0.0002)
+    return TestSystem(
+        name="flexible-waters",
+        system=system,
+        topology=rigid.topology,
+        positions=positions,
+        velocities=velocities,
+        description=f"{n} flexible TIP3P water molecules in vacuum, {temperature:g} K",
+        settings=ComparisonSettings(total_time=0.5, force_evaluations=1000, controls=_FORCE_CONTROL),
+    )
+
+
 SYSTEMS: dict[str, Callable[[], TestSystem]] = {
     "double-pendulum": double_pendulum,
     "double-pendulum-heavy-inside": functools.partial(double_pendulum, inner_mass=1000.0, outer_mass=1.0),
@@ -775,6 +1064,16 @@ SYSTEMS: dict[str, Callable[[], TestSystem]] = {
     "alanine-dipeptide-allbonds": functools.partial(alanine_dipeptide, app.AllBonds),
     "rigid-waters": rigid_waters,
     "rigid-waters-32": functools.partial(rigid_waters, 32),
+    "long-light-heavy-chain": long_light_heavy_chain,
+    "independent-whips": independent_whips,
+    "diatomic-on-wall-5": functools.partial(diatomic_on_wall, 5.0),
+    "diatomic-on-wall-10": functools.partial(diatomic_on_wall, 10.0),
+    "ion-pair": ion_pair,
+    "colliding-water-clusters": colliding_water_clusters,
+    "peptide-in-water": peptide_in_water,
+    "polymer": polymer,
+    "argon-cluster": argon_cluster,
+    "flexible-waters": flexible_waters,
 }
 """The systems by the names under which the command line knows them; each value is called without arguments."""
 
@@ -851,16 +1150,22 @@ def _constraint_arrays(system: openmm.System) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _equilibrated(
-    system: openmm.System, positions: np.ndarray, temperature: float, seed: int
+    system: openmm.System,
+    positions: np.ndarray,
+    temperature: float,
+    seed: int,
+    steps: int = 2000,
+    step: float = 0.001,
+    minimization_tolerance: float = 1e-2,  # kJ/mol/nm
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities, on the constraints, after 2 ps of Langevin dynamics from a minimum of the energy."""
-    integrator = openmm.LangevinMiddleIntegrator(temperature * unit.kelvin, 10.0 / unit.picosecond, 0.001)
+    """Positions and velocities, on the constraints, after some Langevin dynamics from a minimum of the energy."""
+    integrator = openmm.LangevinMiddleIntegrator(temperature * unit.kelvin, 10.0 / unit.picosecond, step)
     integrator.setRandomNumberSeed(seed)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
     context.setPositions(positions)
-    openmm.LocalEnergyMinimizer.minimize(context, 1e-2)
+    openmm.LocalEnergyMinimizer.minimize(context, minimization_tolerance)
     context.setVelocitiesToTemperature(temperature * unit.kelvin, seed)
-    integrator.step(2000)
+    integrator.step(steps)
     state = context.getState(getPositions=True, getVelocities=True)
     return project_onto_constraints(
         system,
