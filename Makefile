@@ -18,7 +18,7 @@ PACKAGE_TOOLS := $(VENV)/.package-tools-installed
 PYTEST_ARGUMENTS ?=
 CXX_FILES = $(shell find openmmapi platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize python-test docs pictures wheel sdist conda install format clean
+.PHONY: all demo test check-format cxx-test sanitize scaling python-test docs pictures wheel sdist conda install format clean
 
 all: test
 
@@ -53,6 +53,15 @@ sanitize: $(TOOLS)
 	$(BIN)/cmake --build $(SANITIZE_BUILD) --parallel $(JOBS)
 	ASAN_OPTIONS=detect_leaks=1:strict_string_checks=1:detect_stack_use_after_return=1 UBSAN_OPTIONS=print_stacktrace=1 \
 		$(BIN)/ctest --test-dir $(SANITIZE_BUILD) --output-on-failure --no-tests=error
+
+# How the cost of the constraint solver grows with the number of constraints; about five minutes, a minute and a half of it for
+# OpenMM to create a Context with 200,000 bonds.
+scaling: install $(TOOLS)
+	$(BIN)/cmake -S . -B $(BUILD) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
+		-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF \
+		-DOPENMMVRATTLE_BUILD_BENCHMARKS=ON
+	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
+	$(BIN)/python benchmarks/scaling.py --program $(BUILD)/benchmarks/VRattleSolverBenchmark --context 200000
 
 python-test: install $(TOOLS)
 	$(BIN)/python -m pytest python/tests

@@ -8,21 +8,16 @@ what the ratio compares; the ratio of the whole step stands beside it. OpenMM's 
 applyVelocityConstraints, that is SETTLE for rigid waters and CCMA for everything else, on the same displaced positions
 and the same velocities. Where OpenMM's solver misses an error, its tolerance is tightened as long as that may help.
 
-A table and one JSON line a measurement are printed; a second table shows how the cost per constraint and the memory
-grow with the number of constraints. Longer chains than its own can be asked for (--chain BONDS), but OpenMM prepares
-CCMA for every Context, whoever integrates it, and that takes minutes for them.
+A table and one JSON line a measurement are printed. How the cost grows with the number of constraints is in scaling.py.
 
-    python benchmarks/constraints.py [--system water ...] [--repeats 7] [--no-scaling] [--chain BONDS ...]
+    python benchmarks/constraints.py [--system water ...] [--repeats 7]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -283,43 +278,6 @@ def compare(name: str, platform: str, repeats: int) -> list[dict]:
     return results
 
 
-def scaling(chains: list[int]) -> list[dict]:
-    """The cost per constraint and the memory of ours, each number of constraints in a process of its own."""
-    results = []
-    for kind, counts in (("water", (10_000, 100_000, 1_000_000)), ("chain", chains)):
-        for count in counts:
-            output = subprocess.run(
-                [sys.executable, __file__, "--scaling-case", kind, str(count)],
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout
-            results.append(json.loads(output))
-            print(output.strip(), flush=True)
-    return results
-
-
-def scaling_case(kind: str, count: int) -> None:
-    """One measurement of scaling()."""
-    problem = water(count // 3) if kind == "water" else chain(count)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    ours = Ours(problem, "Reference")
-    steps = max(3, 1_000_000 // count)
-    seconds = min(ours.measure(1e-8, steps)[0] for _ in range(5))
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(
-        json.dumps(
-            {
-                "benchmark": "constraints-scaling",
-                "system": kind,
-                "constraints": problem.system.getNumConstraints(),
-                "nanoseconds_per_constraint": 1e9 * seconds / problem.system.getNumConstraints(),
-                "kilobytes_per_constraint": (after - before) / problem.system.getNumConstraints(),
-            }
-        )
-    )
-
-
 def show(results: list[dict]) -> None:
     """Print the table."""
     table = rich.table.Table(title="Position solve and velocity projection, at equal error")
@@ -357,31 +315,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--no-scaling", action="store_true", help="leave out the growth with the number of constraints")
-    parser.add_argument("--chain", type=int, nargs="+", default=[1_000, 10_000], help="bonds of the chains that grow")
-    parser.add_argument("--scaling-case", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.scaling_case:
-        scaling_case(arguments.scaling_case[0], int(arguments.scaling_case[1]))
-        return
     results = []
     for name in arguments.system:
         results += compare(name, "Reference", arguments.repeats)
         if name == "water":
             results += compare(name, "CPU", arguments.repeats)
     show(results)
-    if not arguments.no_scaling:
-        table = rich.table.Table(title="Growth with the number of constraints, ours at 1e-8")
-        for column in ("system", "constraints", "ns a constraint", "kB a constraint"):
-            table.add_column(column, justify="right")
-        for r in scaling(arguments.chain):
-            table.add_row(
-                r["system"],
-                str(r["constraints"]),
-                f"{r['nanoseconds_per_constraint']:.1f}",
-                f"{r['kilobytes_per_constraint']:.2f}",
-            )
-        rich.console.Console().print(table)
 
 
 if __name__ == "__main__":
