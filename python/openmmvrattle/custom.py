@@ -523,7 +523,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
         Parameters
         ----------
-        integrator : CustomIntegrator
+        integrator : Integrator
             for example from openmm.XmlSerializer.deserialize()
 
         Returns

@@ -542,3 +542,49 @@ def test_the_context_is_found_and_not_kept_alive() -> None:
     gc.collect()
     with pytest.raises(openmm.OpenMMException, match="not bound"):
         integrator.step(1)
+
+
+@pytest.mark.parametrize("platform, precision, bound", platform_parameters(mixed=1e-6, single=1e-4))
+def test_molecules_put_back_into_the_box_are_no_change(platform: str, precision: str, bound: float) -> None:
+    """Every 250 steps a GPU sorts the particles anew and moves molecules by lengths of the box."""
+    model = waters()
+    system = model.system()
+    force, edge = system.getForce(0), 1.3
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.6)
+    system.setDefaultPeriodicBoxVectors(*(edge * np.eye(3)))
+    integrator = Custom(0.001, monitors=[Custom.ConstraintAndAppliedForce])
+    context = open_on(platform, precision, system, integrator, model)
+    context.setVelocities(model.velocities + np.array([8.0, 0.0, 0.0]))
+    changes, jumps, last = 0.0, 0.0, np.zeros(0)
+    for n in range(270):
+        integrator.step(1)
+        changes += variable(integrator, "change")
+        if n in (247, 248, 249, 250, 251):
+            x = np.array(integrator.getPerDofVariableByName("vrattle_end"))[:, 0]
+            jumps = max(jumps, largest(x - last)) if last.size else 0.0
+            last = x
+    assert jumps > edge - 0.1  # one or more lengths of the box
+    assert changes == 1
+    assert integrator.getNumRescues() == 0
+
+
+def test_inside_a_compound_integrator() -> None:
+    """OpenMM takes its steps without our Python: all is the same but the Context's time and the checks."""
+    model = chain()
+    compound = openmm.CompoundIntegrator()
+    part = Custom(0.0005, constraintTolerance=1e-10)
+    compound.addIntegrator(part)
+    compound.addIntegrator(openmm.VerletIntegrator(0.0005))
+    context = open_context(model.system(), compound, "Reference", model)
+    start = energy_of(context)
+    compound.step(200)
+    assert abs(energy_of(context) - start) < 0.1
+    assert part.getStepDensity() != 1
+    assert part.getNumRescues() == 0
+    # The plugin's time, by itself, is the sum of the steps; here only the variable is.
+    alone = Custom(0.0005, constraintTolerance=1e-10)
+    other = open_context(model.system(), alone, "Reference", model)
+    alone.step(200)
+    assert variable(part, "clock") == pytest.approx(time_of(other), rel=1e-9)
+    assert largest(positions_of(context) - positions_of(other)) < 1e-9
