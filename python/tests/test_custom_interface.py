@@ -6,7 +6,10 @@ from __future__ import annotations
 import copy
 import gc
 import io
+import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -588,3 +591,22 @@ def test_inside_a_compound_integrator() -> None:
     alone.step(200)
     assert variable(part, "clock") == pytest.approx(time_of(other), rel=1e-9)
     assert largest(positions_of(context) - positions_of(other)) < 1e-9
+
+
+def test_the_plugin_runs_where_openmm_has_a_faster_platform() -> None:
+    """Without a platform's name OpenMM takes the fastest that has the kernels: for the plugin not OpenCL."""
+    script = (
+        "import openmm, openmmvrattle\n"
+        "from openmmvrattle.testsystems import rigid_waters\n"
+        "water = rigid_waters()\n"
+        "integrator = openmmvrattle.VariableStepRattleIntegrator(0.001)\n"
+        "context = openmm.Context(water.system, integrator)\n"
+        "context.setPositions(water.positions)\n"
+        "integrator.step(5)\n"
+        "print(context.getPlatform().getName(), [openmm.Platform.getPlatform(i).getName() for i in\n"
+        "      range(openmm.Platform.getNumPlatforms())])\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OPENMM_DEFAULT_PLATFORM"}
+    result = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    print(result.stdout)
+    assert result.stdout.split()[0] in ("CPU", "Reference")
