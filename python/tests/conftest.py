@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import os
 
-# A Context for which no platform is named is one on CPU, also where there is a faster platform. Before OpenMM is imported,
-# and for the scripts that tests run too. (OpenCL on a processor, PoCL, is there for the tests that name it; with PoCL 3.1
-# OpenMM's minimiser crashes.)
+# A Context for which no platform is named is one on CPU, also where there is a faster platform. This must be set before
+# OpenMM is imported, and holds for the scripts that tests run too. (OpenCL on a processor, PoCL, is there for the tests
+# that name it; with PoCL 3.1 OpenMM's minimiser crashes.)
 os.environ.setdefault("OPENMM_DEFAULT_PLATFORM", "CPU")
 
 import openmm  # noqa: E402
