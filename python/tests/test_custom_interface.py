@@ -17,6 +17,7 @@ import numpy as np
 import openmm
 import openmmvrattle
 import pytest
+from citizen import solvated
 from custom_support import largest, light_molecules, open_on, platform_parameters, variable
 from dense_reference import (
     chain,
@@ -397,8 +398,8 @@ def test_what_changes_by_rounding_only_does_not() -> None:
     assert largest(positions_of(context) - model.positions) < 1e-9
 
 
-def test_a_thermostat_and_a_barostat() -> None:
-    """They change the state within steps: the density follows, at no more evaluations, and the ensemble is right."""
+def test_a_thermostat() -> None:
+    """It changes the state within steps: the density follows, at no more evaluations, and the ensemble is right."""
     test = alanine_dipeptide()
     system = copy.deepcopy(test.system)
     thermostat = openmm.AndersenThermostat(300, 20)
@@ -418,6 +419,31 @@ def test_a_thermostat_and_a_barostat() -> None:
     assert integrator.getNumForceEvaluations() == 3001
     assert integrator.getNumRescues() < 30
     assert 0.4 < min(densities) and max(densities) < 10
+
+
+def test_a_barostat() -> None:
+    """It moves molecules within steps: the density follows, and the volume changes."""
+    modeller, field = solvated(count=60)
+    cutoff = 0.5 * unit.nanometer
+    system = field.createSystem(modeller.topology, nonbondedMethod=app.CutoffPeriodic, nonbondedCutoff=cutoff)
+    barostat = openmm.MonteCarloBarostat(1, 300, 5)
+    barostat.setRandomNumberSeed(2)
+    system.addForce(barostat)
+    integrator = Custom(0.001, monitors=[Custom.ConstraintAndAppliedForce])
+    context = open_context(system, integrator, "CPU")
+    context.setPositions(modeller.positions)
+    openmm.LocalEnergyMinimizer.minimize(context, 100, 50)
+    context.setVelocitiesToTemperature(300, 1)
+    before = context.getState().getPeriodicBoxVolume()._value
+    densities, changes = [], 0.0
+    for _ in range(150):
+        integrator.step(1)
+        densities.append(integrator.getStepDensity())
+        changes += variable(integrator, "change")
+    assert 2 < changes <= 31
+    assert context.getState().getPeriodicBoxVolume()._value != before
+    assert 0.5 < min(densities) and max(densities) < 5
+    assert integrator.getNumRescues() < 5
 
 
 class Counter:
