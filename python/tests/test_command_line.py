@@ -377,6 +377,24 @@ def test_info() -> None:
     assert content["versions"]["SWIG runtime"].isdigit()
 
 
+def test_what_a_platform_prints_is_not_in_the_output_of_info() -> None:
+    """OpenCL warns of drivers that OpenMM was not tried with, on standard output."""
+    script = (
+        "import os, sys\n"
+        "from openmmvrattle.commands import info\n"
+        "make = info._integrators()['CustomVariableStepRattleIntegrator']\n"
+        "def loud():\n"
+        "    os.write(1, b'a warning')\n"
+        "    return make()\n"
+        "info._integrators = lambda: {'VariableStepRattleIntegrator': loud}\n"
+        "from openmmvrattle.__main__ import main\n"
+        "main(['info', '--json'])\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert json.loads(result.stdout)["healthy"] is True
+    assert "a warning" in result.stderr
+
+
 def test_info_says_what_is_wrong(monkeypatch, capsys) -> None:
     monkeypatch.setattr(openmmvrattle, "pluginLoadFailures", ["libOpenMMVRattleReference.so: no such file [at all]"])
     assert command_line.main(["info"]) == 1

@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import importlib.metadata
 import json
+import os
 import platform
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import openmm
@@ -46,9 +48,10 @@ def run(options: argparse.Namespace) -> int:
 def information() -> dict[str, Any]:
     """Find out everything that the command shows."""
     platforms = [openmm.Platform.getPlatform(index) for index in range(openmm.Platform.getNumPlatforms())]
-    found = {
-        each.getName(): {name: _problem(make, each) for name, make in _integrators().items()} for each in platforms
-    }
+    with _standard_output_to_error():
+        found = {
+            each.getName(): {name: _problem(make, each) for name, make in _integrators().items()} for each in platforms
+        }
     failures = {
         "OpenMM-VRATTLE": list(openmmvrattle.pluginLoadFailures),
         "OpenMM": list(openmm.Platform.getPluginLoadFailures()),
@@ -63,6 +66,19 @@ def information() -> dict[str, Any]:
         "plugin_load_failures": failures,
         "folder": str(next(iter(openmmvrattle.__path__))),
     }
+
+
+@contextlib.contextmanager
+def _standard_output_to_error() -> Iterator[None]:
+    """Keep what a platform prints, such as OpenCL's warning of an untried driver, out of what this command prints."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _versions() -> dict[str, str]:
