@@ -18,8 +18,8 @@ rho the step density that a monitor with given bounds would have asked for,
     P = max |e - e0| / max |e - e0| (mean(rho) / rho)^2
 
 says by how much the largest energy error would shrink at an equal number of force evaluations. Measured gains are about
-0.45 P, since the density lags behind the monitor and steps that vary have errors of their own. Below P = 2 variable
-steps have nothing to offer, above 5 they practically always pay.
+0.45 P, since the density lags behind the monitor and steps that vary have errors of their own. Below P = 2.2 variable
+steps have nothing to offer, above 5 they practically always pay, and in between it depends.
 
 Where the steps of the trial are too large for the hardest moments, the energy does not come back, and e is no local
 error any more. Then e is replaced by the leading term of the error, -step^2 (V''/12 + U^2/24) with V'' the second time
@@ -71,13 +71,16 @@ BOUNDS = ((1 / 20, 1.25), (1 / 50, 2.0), (1 / 100, 4.0), (1 / 100, 10.0), (1e-4,
 """The bounds that are judged by default, the smallest and the largest step divided by the nominal one."""
 GAIN_OF_PREDICTOR = 0.45
 """The gain that is expected for P = 1."""
-LEAST_GAIN = 1.5
-"""Variable steps are recommended from this expected gain on."""
-_WORTHLESS_GAIN = 1.0
+SURE_PREDICTOR = 5.0
+"""Variable steps are recommended from this P on."""
+LEAST_PREDICTOR = 2.2
+"""Below this P nothing is gained."""
 _NEARLY_AS_GOOD = 0.67
 """Of candidates whose P is at least this part of the best one, the one with the narrowest bounds is recommended."""
 _LAST_RESORT = ("VectorField", "ArcLength", "MaxParticleArcLength", "MaxForce", "MultiplierPNorm")
 """Monitors that mix units, have kinks, or follow from how constraints are written: only where no other is as good."""
+_LOST_ENERGY = 10.0
+"""A trial whose energy error is that many times the energies at the start has failed."""
 _NEED_CONSTRAINTS = ("ConstraintMultipliers", "ConstraintForce", "MultiplierPNorm")
 _HALVINGS = 4
 """How often the step of a trial that fails is halved."""
@@ -206,8 +209,8 @@ class Advice:
             )
             lines.append("Or without any settings: useAutomaticStepControl(), which mostly gains somewhat less.")
         elif self.verdict == "little to gain":
-            lines.append(f"Use fixed steps: there is little to gain. The best was {what}: {gain}.")
-            lines.append("useAutomaticStepControl() does no harm, and takes its chance.")
+            lines.append(f"Use fixed steps: there is little to gain, if anything. The best was {what}: {gain}.")
+            lines.append("Measure it before you use it: the option --check, or measured_gain().")
         else:
             lines.append(
                 f"Use fixed steps: nothing promises a gain. The largest P is {two_digits(self.largest_predictor)}."
@@ -320,16 +323,20 @@ def advise_on(
         raise ValueError(f"The step size must be positive, and not {step_size:g} ps.")
     if steps < 10:
         raise ValueError(f"A trial needs at least 10 steps, and not {steps}.")
-    if not start.system.getNumConstraints():
+    # A monitor that was made for the system, as a distance from its walls.
+    own = [m for control in start.settings.controls for m in control.monitors if m.kind == "ForceGroupEnergy"]
+    if monitors is MONITORS and start.monitor_force_group is not None:
+        monitors = [*MONITORS, *dict.fromkeys(own)]
+    if not start.system.getNumConstraints() and not start.expression_constraints:
         monitors = [monitor for monitor in monitors if monitor.kind not in _NEED_CONSTRAINTS]
     kinds = list(dict.fromkeys([*(monitor.kind for monitor in monitors), "ConstraintAndAppliedForce"]))
     trial, notes = _trial_that_works(start, step_size, steps, platform, constraint_tolerance, kinds, progress)
     resolved = trial.is_resolved()
     candidates = _candidates(trial, resolved, monitors, bounds)
     best = _recommended(candidates)
-    if best is None or best.expected_gain < _WORTHLESS_GAIN:
+    if best is None or best.predictor < LEAST_PREDICTOR:
         verdict = "fixed steps"
-    elif best.expected_gain < LEAST_GAIN:
+    elif best.predictor < SURE_PREDICTOR:
         verdict = "little to gain"
     else:
         verdict = "variable steps"
@@ -457,6 +464,7 @@ def _run_trial(
     integrator.setMaximumStepSize(step_size * (1.0 + 1e-9))
     integrator.setConstraintTolerance(tolerance)
     try:
+        start.prepare(integrator)
         context = openmm.Context(start.system, integrator, openmm.Platform.getPlatformByName(platform))
         for name, value in start.parameters:
             context.setParameter(name, value)
@@ -467,11 +475,13 @@ def _run_trial(
         for step in range(steps + 1):
             if step:
                 integrator.step(1)
-            state = context.getState(energy=True)
+            state = context.getState(energy=True, groups=start.force_groups)
             energies[step] = state.getPotentialEnergy()._value, state.getKineticEnergy()._value
             values[step] = [integrator.getMonitorValue(index) for index in range(len(kinds))]
             if not np.all(np.isfinite(energies[step])):
                 raise AdviceError(f"at {step * step_size:.4g} ps the energy is not a number any more")
+            if abs(energies[step].sum() - energies[0].sum()) > _LOST_ENERGY * (np.abs(energies[0]).sum() + 1.0):
+                raise AdviceError(f"at {step * step_size:.4g} ps the energy is lost")
             if progress is not None and step % 64 == 0:
                 progress(step / steps)
     except AdviceError:

@@ -143,8 +143,10 @@ def draw_trial(advice: Advice, description: str) -> Figure:
         return values[:whole].reshape(-1, windows).max(axis=1)
 
     times = reduced(trial.times)
-    top.plot(times, np.maximum(reduced(np.abs(trial.energy_errors)), _ENERGY_FLOOR), color=_COLOURS["control"])
+    errors = np.maximum(reduced(np.abs(trial.energy_errors)), _ENERGY_FLOOR)
+    top.plot(times[1:], errors[1:], color=_COLOURS["control"])
     top.set_yscale("log")
+    top.set_ylim(bottom=max(float(errors[1:].min()) / 3.0, 1e-6 * float(errors.max())))
     top.set_ylabel("energy error |E - E(0)|\n(kJ/mol)")
     top.set_title(f"{description}: fixed steps of {trial.step_size:.4g} ps", fontsize=11)
     best: dict[str, float] = {}

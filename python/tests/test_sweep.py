@@ -311,7 +311,12 @@ def test_interrupt_of_several_processes(tmp_path, whom):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
-        time.sleep(6.0)
+        # The command, the process from which others are copied, the one that watches over resources, and two at work.
+        deadline = time.monotonic() + 60
+        while _processes_of(process.pid) < 5:
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.05)
+        time.sleep(0.5)
         if whom == "the command alone":
             process.send_signal(signal.SIGINT)
         else:
@@ -327,6 +332,11 @@ def test_interrupt_of_several_processes(tmp_path, whom):
     finally:
         if _group_lives(process.pid):
             os.killpg(process.pid, signal.SIGKILL)
+
+
+def _processes_of(group: int) -> int:
+    listing = subprocess.run(["ps", "-e", "-o", "pgid="], capture_output=True, text=True, check=True).stdout
+    return listing.split().count(str(group))
 
 
 def _group_lives(group: int) -> bool:
