@@ -172,7 +172,7 @@ def print_advice(console: Any, advice: Advice) -> None:
 
     bounds = sorted({candidate.bounds for candidate in advice.candidates}, key=lambda pair: (pair[1] or 1e9, -pair[0]))
     table = Table(
-        title="Each monitor along the trial, and P for bounds of the steps: below 2.2 nothing is gained, above 5 it pays",
+        title="Each monitor along the trial, and P for bounds of the steps: below 2.2 no gain, above 5 it pays",
         title_justify="left",
     )
     table.add_column("monitor", no_wrap=True)
