@@ -37,8 +37,6 @@ from openmmvrattle.testsystems import SYSTEMS, TestSystem
 
 PARTS = (0.5, 1.0, 2.0)
 """Steps of the trial, relative to those that are recommended for the system."""
-SYSTEMS_OF_BENCHMARK = tuple(name for name in SYSTEMS if name not in ("peptide-in-water", "polymer"))
-"""All but the two that have thousands of particles."""
 LEAST_STEPS_OF_PENDULUM = 40_000
 """Fixed steps fail altogether below about 33,000."""
 
@@ -77,7 +75,7 @@ class Row:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=SYSTEMS_OF_BENCHMARK, metavar="NAME")
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=list(SYSTEMS), metavar="NAME")
     parser.add_argument("--best-only", action="store_true", help="do not run the other candidates")
     parser.add_argument("--output", type=Path, default=Path("out/advise"), metavar="FOLDER")
     options = parser.parse_args(arguments)

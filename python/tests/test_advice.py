@@ -4,8 +4,12 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import openmm
@@ -291,3 +295,22 @@ def test_progress_of_the_trial():
     advise_on(rigid_waters(1), 0.001, 200, progress=fractions.append)
     assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] <= 1.0 and len(fractions) > 2
     assert isinstance(advise_on(rigid_waters(1), 0.001, 20).trial, Trial)
+
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "advise.py"
+
+
+@pytest.mark.skipif(not SCRIPT.exists(), reason="needs the folder benchmarks")
+def test_the_benchmark_of_the_advice(tmp_path):
+    """It measures what it says: each candidate once, at the number of steps that is recommended for the system."""
+    command = [sys.executable, str(SCRIPT), "--systems", "nitrogen-collision-5", "--output", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    assert "3 of 3 verdicts are right." in result.stdout
+    with (tmp_path / "advise.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [sum(row["steps"] == steps for row in rows) for steps in ("200", "400", "800")] == [1, 55, 1]
+    best = next(row for row in rows if row["steps"] == "400" and row["is_best"] == "True")
+    advice, start = advice_on("nitrogen-collision-5")
+    assert float(best["gain"]) == pytest.approx(measured_gain(advice, start)[0], rel=1e-6)
+    assert (tmp_path / "advise.png").read_bytes().startswith(b"\x89PNG")
