@@ -5,10 +5,10 @@
     python benchmarks/automatic.py [--systems NAME ...] [--jobs N] [--quick] [--output FOLDER]
 
 The gain is the largest energy error of RATTLE with fixed steps divided by that with automatic step control, over the
-same time and with the same number of steps: the nominal step is adjusted until this number is about the wanted one, and
-fixed steps get just as many. Automatic step control takes trial steps besides, once for each run: the calibration of
-300 steps and two steps backwards. The last column counts them as steps that the fixed ones could have taken too; in a
-run of a million steps they count for nothing.
+same time and with the same number of steps: the nominal step is adjusted until this number is about the wanted one,
+but to no more than twice the mean step, and fixed steps get just as many. Automatic step control takes trial steps
+besides, once for each run: the calibration of 300 steps and two steps backwards. The last column counts them as steps
+that the fixed ones could have taken too; in a run of a million steps they count for nothing.
 
 Energy errors of chaotic motions scatter, so every number is the geometric mean over several starts: other seeds of
 thermal systems, other velocities (by a fiftieth of their size, at random) of the mechanical ones.
@@ -58,6 +58,7 @@ from openmmvrattle.testsystems import (
 TOLERANCE = 1e-10  # of the constraints, relative
 NEAR = 0.1  # the number of steps may differ by this fraction from the wanted one
 MOST_TRIES = 6
+LONGEST_STEP = 2.0  # of nominal steps, relative to the mean step that is wanted: nobody would choose a longer one
 LEAST_GAIN = 0.95  # on every system
 DISTURBANCE = 0.02  # of the velocities of a mechanical system, relative to their root mean square
 
@@ -186,24 +187,29 @@ def run(start: TestSystem, total_time: float, step: float, automatic: bool, most
     context.setVelocities(start.velocities)
     first = energy_of(context)
     worst, steps, largest = 0.0, 0, 0.0
+
+    def remaining() -> float:
+        # The last step is the one that ends nearest to the time.
+        return total_time - context.getTime()._value - 0.5 * integrator.getStepSize()._value
+
     try:
-        while context.getTime()._value < total_time * (1 - 1e-9) and steps < most_steps:
+        while remaining() > 0 and steps < most_steps:
             integrator.step(1)
             steps += 1
             worst = max(worst, abs(energy_of(context) - first))
             largest = max(largest, integrator.getStepDensity())
     except openmm.OpenMMException:
         return Run(steps, 0, math.inf, step, largest)
-    simulated = context.getTime()._value
     trial_steps = integrator.getNumForceEvaluations() - 1 - steps
-    if simulated < total_time * (1 - 1e-9):
-        return Run(math.ceil(steps * total_time / simulated), trial_steps, math.inf, step, largest)
+    if remaining() > 0:
+        return Run(math.ceil(steps * total_time / context.getTime()._value), trial_steps, math.inf, step, largest)
     return Run(steps, trial_steps, worst if math.isfinite(worst) else math.inf, step, largest)
 
 
 def adjusted_run(start: TestSystem, total_time: float, steps: int) -> Run:
-    """The run of automatic step control with about as many steps as are wanted."""
+    """The run of automatic step control with about as many steps as are wanted, as far as LONGEST_STEP allows it."""
     step = total_time / steps
+    longest = LONGEST_STEP * step
     too_small, too_large = 0.0, math.inf
     nearest = None
     for _ in range(MOST_TRIES):
@@ -220,7 +226,9 @@ def adjusted_run(start: TestSystem, total_time: float, steps: int) -> Run:
         guess = 0.5 * step if failed and trial.steps < steps else step * trial.steps / steps
         if not too_small < guess < too_large:
             guess = math.sqrt(too_small * too_large) if too_small > 0 else 0.5 * too_large
-        step = guess
+        if step == longest == min(guess, longest):
+            break
+        step = min(guess, longest)
     if nearest is None:
         raise RuntimeError(f"no run of {start.name} reached its end")
     return nearest

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: MIT
 """Long runs of rigid water: does the energy drift, and do the constraints hold?
 
-    python benchmarks/drift.py [--quick] [--output out]
+    python benchmarks/drift.py [--quick] [--systems NAME ...] [--integrators NAME ...] [--output out]
 
 Two systems, 8 waters in a soft trap (10^6 steps from each of 8 starts, platform Reference) and a periodic box of 216
-waters with PME (10^5 steps, platform CPU), are each run by four integrators, with as many evaluations of the forces for
+waters with PME (10^5 steps, platform CPU), are each run by five integrators, with as many evaluations of the forces for
 each: VariableStepRattleIntegrator with the monitor ConstraintMultipliers (the paper's U2) and with
-ConstraintAndAppliedForce, OpenMM's VerletIntegrator with the mean step of the former, and VariableVerletIntegrator with
+ConstraintAndAppliedForce, OpenMM's VerletIntegrator with the mean step of the former (1 fs if that is not run),
+VariableStepRattleIntegrator with automatic step control and the same nominal step, and VariableVerletIntegrator with
 the error tolerance that gives that mean step.
 
 The drift is the slope of a straight line through the total energy. An energy can also go up and down at random, ever
@@ -46,6 +47,7 @@ BOLTZMANN = 0.00831446261815324  # kJ/mol/K
 COLOURS = {
     "VRATTLE U2": "#D55E00",
     "VRATTLE force": "#009E73",
+    "VRATTLE automatic": "#000000",
     "Verlet": "#E69F00",
     "VariableVerlet": "#56B4E9",
 }
@@ -280,12 +282,16 @@ def simulate(
     return run, series
 
 
-def run_problem(problem: Problem, progress: Callable[[str], None]) -> tuple[list[Run], dict[str, Series]]:
-    """All four integrators on one problem."""
+def run_problem(
+    problem: Problem, names: Sequence[str], progress: Callable[[str], None]
+) -> tuple[list[Run], dict[str, Series]]:
+    """The integrators of these names on one problem."""
     runs: list[Run] = []
     series: dict[str, Series] = {}
 
     def add(name: str, make: Callable[[], Any]) -> None:
+        if name not in names:
+            return
         run, its_series = simulate(problem, name, make, progress)
         runs.append(run)
         series[name] = its_series
@@ -297,8 +303,11 @@ def run_problem(problem: Problem, progress: Callable[[str], None]) -> tuple[list
 
     add("VRATTLE U2", lambda: make_vrattle(VariableStepRattleIntegrator.ConstraintMultipliers))
     add("VRATTLE force", lambda: make_vrattle(VariableStepRattleIntegrator.ConstraintAndAppliedForce))
-    mean_step = runs[0].mean_step
+    mean_step = runs[0].mean_step if "VRATTLE U2" in names else NOMINAL_STEP
+    add("VRATTLE automatic", lambda: VariableStepRattleIntegrator(mean_step, automatic=True))
     add("Verlet", lambda: make_openmm(openmm.VerletIntegrator, mean_step))
+    if "VariableVerlet" not in names:
+        return runs, series
     tolerance = tuned_variable_verlet(problem, mean_step)
     add("VariableVerlet", lambda: make_openmm(openmm.VariableVerletIntegrator, tolerance))
     return runs, series
@@ -326,18 +335,18 @@ def verdict(runs: Sequence[Run]) -> list[str]:
 
 def table(runs: Sequence[Run]) -> list[str]:
     header = (
-        f"{'system':<10} {'integrator':<14} {'steps':>11} {'mean step':>9} {'drift':>17} {'per freedom':>11} "
+        f"{'system':<10} {'integrator':<17} {'steps':>11} {'mean step':>9} {'drift':>17} {'per freedom':>11} "
         f"{'walk':>9} {'fluctuation':>11} {'constraints':>11} {'wall':>5}"
     )
     units = (
-        f"{'':<10} {'':<14} {'':>11} {'fs':>9} {'kJ/mol/ns':>17} {'kT/ns':>11} {'kJ/mol/√ns':>9} {'kJ/mol':>10} "
+        f"{'':<10} {'':<17} {'':>11} {'fs':>9} {'kJ/mol/ns':>17} {'kT/ns':>11} {'kJ/mol/√ns':>9} {'kJ/mol':>10} "
         f"{'worst':>11} {'s':>5}"
     )
     lines = [header, units, "-" * len(header)]
     for run in runs:
         steps = f"{run.starts} x {run.steps}" if run.starts > 1 else str(run.steps)
         lines.append(
-            f"{run.problem:<10} {run.integrator:<14} {steps:>11} {1000 * run.mean_step:>9.4f} "
+            f"{run.problem:<10} {run.integrator:<17} {steps:>11} {1000 * run.mean_step:>9.4f} "
             f"{run.drift:>8.3g} ± {run.drift_error:<6.2g} {run.drift_per_freedom:>11.1e} {run.walk:>9.2g} "
             f"{run.fluctuation:>11.3g} {run.constraint_error:>11.1e} {run.wall_time:>5.0f}"
         )
@@ -349,8 +358,8 @@ def draw(problems: Sequence[Problem], all_series: Sequence[dict[str, Series]]) -
     figure = Figure(figsize=(9.0, 3.6 * len(problems)), dpi=100, layout="constrained")
     panels = figure.subplots(len(problems), 1, squeeze=False)[:, 0]
     for axes, problem, series in zip(panels, problems, all_series, strict=True):
-        for name in ("VariableVerlet", "VRATTLE U2", "VRATTLE force", "Verlet"):
-            for number, (times, energies) in enumerate(series[name]):
+        for name in ("VariableVerlet", "VRATTLE U2", "VRATTLE force", "Verlet", "VRATTLE automatic"):
+            for number, (times, energies) in enumerate(series.get(name, [])):
                 size = max(1, len(times) // 100)
                 count = len(times) // size
                 x = times[: count * size].reshape(count, size).mean(axis=1)
@@ -383,18 +392,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Energy drift of long runs of rigid water.")
     parser.add_argument("--quick", action="store_true", help="a hundredth of the steps: seconds, and no verdict")
     parser.add_argument("--output", type=Path, default=Path("out"), help="folder of drift.png and drift.csv")
+    systems = {"8-waters": small_problem, "216-waters": box_problem}
+    parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), metavar="NAME")
+    parser.add_argument(
+        "--integrators",
+        nargs="+",
+        choices=COLOURS,
+        default=list(COLOURS),
+        metavar="NAME",
+        help="VerletIntegrator, the measure of the others, is always run: " + ", ".join(COLOURS),
+    )
     options = parser.parse_args(arguments)
+    names = {*options.integrators, "Verlet"}
     options.output.mkdir(parents=True, exist_ok=True)
 
     def progress(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    problems = [small_problem(options.quick), box_problem(options.quick)]
+    problems = [systems[name](options.quick) for name in options.systems]
     runs: list[Run] = []
     all_series = []
     faults: list[str] = []
     for problem in problems:
-        its_runs, series = run_problem(problem, progress)
+        its_runs, series = run_problem(problem, names, progress)
         runs += its_runs
         all_series.append(series)
         faults += verdict(its_runs)
