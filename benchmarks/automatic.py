@@ -6,7 +6,7 @@
 
 The gain is the largest energy error of RATTLE with fixed steps divided by that with automatic step control, over the
 same time and with the same number of steps: the nominal step is adjusted until this number is about the wanted one,
-but to no more than twice the mean step, and fixed steps get just as many. Automatic step control takes trial steps
+but to no more than four times the mean step, and fixed steps get just as many. Automatic step control takes trial steps
 besides, once for each run: the calibration of 300 steps and two steps backwards. The last column counts them as steps
 that the fixed ones could have taken too; in a run of a million steps they count for nothing.
 
@@ -58,7 +58,7 @@ from openmmvrattle.testsystems import (
 TOLERANCE = 1e-10  # of the constraints, relative
 NEAR = 0.1  # the number of steps may differ by this fraction from the wanted one
 MOST_TRIES = 6
-LONGEST_STEP = 2.0  # of nominal steps, relative to the mean step that is wanted: nobody would choose a longer one
+LONGEST_STEP = 4.0  # of nominal steps, relative to the mean step that is wanted: nobody would choose a longer one
 LEAST_GAIN = 0.95  # on every system
 DISTURBANCE = 0.02  # of the velocities of a mechanical system, relative to their root mean square
 
@@ -90,7 +90,7 @@ PROBLEMS: dict[str, Problem] = {
         Problem("N2 + N2, 20 km/s", functools.partial(nitrogen_collision, 20.0), 0.1, (800, 1_600), least_gain=2.5),
         Problem("N2 on a wall, 5 km/s", functools.partial(diatomic_on_wall, 5.0), 0.4, (800, 1_600)),
         Problem("N2 on a wall, 10 km/s", functools.partial(diatomic_on_wall, 10.0), 0.2, (800, 1_600)),
-        Problem("ion pair", ion_pair, 3.0, (1_000, 4_000)),
+        Problem("ion pair", ion_pair, 3.0, (2_000, 4_000)),
         Problem("8 waters", rigid_waters, 2.0, (1_000, 4_000), takes_seed=True),
         Problem("32 waters", functools.partial(rigid_waters, 32), 0.5, (400, 800), takes_seed=True),
         Problem("alanine dipeptide, 300 K", alanine_dipeptide, 2.0, (1_000, 4_000), takes_seed=True),
@@ -213,7 +213,7 @@ def adjusted_run(start: TestSystem, total_time: float, steps: int) -> Run:
     too_small, too_large = 0.0, math.inf
     nearest = None
     for _ in range(MOST_TRIES):
-        trial = run(start, total_time, step, True, 3 * steps)
+        trial = run(start, total_time, step, True, 12 * steps)
         failed = trial.error == math.inf
         if not failed and (nearest is None or abs(trial.steps - steps) < abs(nearest.steps - steps)):
             nearest = trial
@@ -344,6 +344,9 @@ def draw_monitors() -> Figure:
     right.loglog(u, (1 + (u / 2) ** 16) ** (1 / 16), color="k")
     right.axvspan(0.1, 2.0, color="0.92", zorder=0)
     right.set(xlabel="$u$", ylabel=r"$\varphi(u)$", title="the dead zone", ylim=(0.5, 6), xlim=(0.1, 10))
+    right.set_yticks([0.5, 1, 2, 5], ["0.5", "1", "2", "5"])
+    right.set_xticks([0.1, 1, 2, 10], ["0.1", "1", "2", "10"])
+    right.minorticks_off()
     return figure
 
 

@@ -4,7 +4,13 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
+import json
+import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -29,6 +35,7 @@ from dense_reference import (
 from openmmvrattle import VariableStepRattleIntegrator, XmlSerializer
 from openmmvrattle.testsystems import TestSystem, alanine_dipeptide, light_heavy_chain, nitrogen_collision, rigid_waters
 
+ROOT = Path(__file__).parents[2]
 LENGTH = 0.0125  # nm, of the product of force and squared speed
 
 
@@ -673,3 +680,50 @@ def test_a_calibration_that_fails_takes_shorter_steps() -> None:
     with pytest.raises(openmm.OpenMMException, match=r"trial run of automatic step control.*smaller step size"):
         hopeless.step(1)
     np.testing.assert_array_equal(positions_of(context), test.positions)
+
+
+# ------------------------------------------------------------------------------------------------------ the benchmark
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> ModuleType:
+    path = ROOT / "benchmarks" / "automatic.py"
+    if not path.exists():
+        pytest.skip("needs the folder benchmarks")
+    specification = importlib.util.spec_from_file_location("automatic_benchmark", path)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_the_benchmark_runs(benchmark: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.main(["--quick", "--systems", "whip", "8 waters", "--output", str(tmp_path)]) == 0
+    lines = (tmp_path / "automatic.jsonl").read_text(encoding="utf-8").splitlines()
+    results = [json.loads(line) for line in lines]
+    assert [r["system"] for r in results] == ["whip", "whip", "8 waters", "8 waters"]
+    for result in results:
+        assert result["gain"] > 0.5
+        assert 0 < result["counted_gain"] < result["gain"]
+    assert "| whip |" in capsys.readouterr().out
+    for name in ("gains.png", "monitors.png"):
+        assert (tmp_path / name).read_bytes()[1:4] == b"PNG"
+
+
+def test_the_benchmark_finds_a_loss(benchmark: ModuleType) -> None:
+    good, bad = (benchmark.Run(1000, 302, error, 0.001, 1.0) for error in (1.0, 1.2))
+    whip, water = benchmark.PROBLEMS["whip"], benchmark.PROBLEMS["8 waters"]
+    assert benchmark.faults([benchmark.summary(water, 1000, [(bad, good), (good, good)])]) == []
+    assert len(benchmark.faults([benchmark.summary(water, 1000, [(good, bad), (good, good)])])) == 1
+    assert len(benchmark.faults([benchmark.summary(whip, 1000, [(bad, good)])])) == 1
+
+
+def test_the_documentation_claims_what_was_measured(benchmark: ModuleType) -> None:
+    """Every system of the benchmark is in the table, twice, with a gain not below its claim."""
+    page = (ROOT / "docs" / "automatic.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.+?) \| ([\d,]+) \| ([\d.e+,]+) \|", page, re.MULTILINE)
+    for name, problem in benchmark.PROBLEMS.items():
+        gains = [float(gain.replace(",", "")) for system, _, gain in rows if system == name]
+        assert len(gains) == 2, name
+        assert min(gains) >= problem.least_gain, name

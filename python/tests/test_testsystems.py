@@ -273,4 +273,4 @@ def test_readme_shows_what_runs():
     for block in blocks[:2]:
         exec(block, names)
     assert names["context"].getTime()._value == pytest.approx(3.0)
-    assert names["molecular"].getNumMonitors() == 1
+    assert names["molecular"].isAutomatic()
