@@ -73,7 +73,7 @@ def test_quick_run(drift: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixt
         # Tuned on trial runs that are as short.
         assert variable["mean_step"] == pytest.approx(ours[0]["mean_step"], rel=0.15)
         for run in system:
-            # One evaluation a step, and one more where a run of ours begins, besides the trial steps of automatic control.
+            # One evaluation a step, and one more where a run of ours begins; automatic control has trial steps besides.
             at_start = 303 if run["integrator"] == "VRATTLE automatic" else 1
             assert 0 <= run["force_evaluations"] - run["starts"] * run["steps"] <= at_start * run["starts"]
         for run in ours:
