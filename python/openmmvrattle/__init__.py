@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import openmm
 import openmm.version
 
+from . import constraints
 from .custom import ConstraintWarning, CustomVariableStepRattleIntegrator
 from .serialization import XmlSerializer
 
@@ -33,6 +34,7 @@ __all__ = [
     "VariableStepRattleIntegrator",
     "XmlSerializer",
     "advise",
+    "constraints",
     "pluginLoadFailures",
 ]
 # What of these needs the compiled part of the package.

@@ -38,10 +38,32 @@ KINDS = (
 )
 
 
-class DenseConstraints:
-    """Distance constraints g_k = |q_i - q_j|^2 - L_k^2 between particles with masses."""
+@dataclass
+class GeneralConstraint:
+    """A constraint g = 0 as the plugin gets it, and once more in NumPy.
 
-    def __init__(self, masses: Sequence[float] | Array, pairs: Sequence[tuple[int, int]], lengths: Array) -> None:
+    value and gradient take the positions of the particles (n x 3), which may be complex: derivatives along a direction v
+    are the imaginary part at q + i 1e-30 v, exact to rounding.
+    """
+
+    expression: str
+    particles: list[int]
+    parameters: dict[str, float]
+    value: Callable[[Any], Any]
+    gradient: Callable[[Any], Any]
+
+
+class DenseConstraints:
+    """Distance constraints g_k = |q_i - q_j|^2 - L_k^2 between particles with masses, and general ones behind them."""
+
+    def __init__(
+        self,
+        masses: Sequence[float] | Array,
+        pairs: Sequence[tuple[int, int]],
+        lengths: Array,
+        general: Sequence[GeneralConstraint] = (),
+    ) -> None:
+        self.general = list(general)
         self.masses = np.asarray(masses, dtype=float)
         self.pairs = [(int(i), int(j)) for i, j in pairs]
         self.lengths = np.asarray(lengths, dtype=float)
@@ -58,20 +80,35 @@ class DenseConstraints:
         return (self.difference @ x).reshape(-1, 3)
 
     def g(self, q: Array) -> Array:
-        return np.sum(self.separations(q) ** 2, axis=1) - self.lengths**2
+        distances = np.sum(self.separations(q) ** 2, axis=1) - self.lengths**2
+        return np.concatenate([distances, [c.value(q.reshape(-1, 3)[c.particles]) for c in self.general]])
 
-    def half_derivative_of_second(self, v: Array) -> Array:
-        """Half the derivative of g''(v,v) with respect to v; for distances it is G with v in place of q."""
-        return self.jacobian(v)
+    def _general_rows(self, gradients: list[Array]) -> Array:
+        """The rows of the general constraints, from the derivatives with respect to their own particles; 0 for anchors."""
+        rows = np.zeros((len(self.general), self.masses.size, 3))
+        for row, c, gradient in zip(rows, self.general, gradients, strict=True):
+            row[c.particles] = gradient
+        rows[:, self.masses == 0] = 0
+        return rows.reshape(len(self.general), self.m3.size)
+
+    def _distance_jacobian(self, x: Array) -> Array:
+        r = self.separations(x)
+        return 2 * np.einsum("ka,kan->kn", r, self.difference.reshape(len(self.pairs), 3, -1))
 
     def jacobian(self, q: Array) -> Array:
         """G = dg/dq."""
-        r = self.separations(q)
-        return 2 * np.einsum("ka,kan->kn", r, self.difference.reshape(len(self.pairs), 3, -1))
+        gradients = [c.gradient(q.reshape(-1, 3)[c.particles]) for c in self.general]
+        return np.concatenate([self._distance_jacobian(q), self._general_rows(gradients)])
 
-    def second(self, v: Array) -> Array:
+    def velocity_jacobian(self, q: Array, v: Array) -> Array:
+        """G(v), with the rows (d^2g/dq^2 v)^T: half the derivative of g''(v,v) with respect to v."""
+        shifted = q + 1e-30j * v
+        gradients = [c.gradient(shifted.reshape(-1, 3)[c.particles]).imag / 1e-30 for c in self.general]
+        return np.concatenate([self._distance_jacobian(v), self._general_rows(gradients)])
+
+    def second(self, q: Array, v: Array) -> Array:
         """g''(v,v)."""
-        return 2 * np.sum(self.separations(v) ** 2, axis=1)
+        return self.velocity_jacobian(q, v) @ v
 
     def matrix(self, q: Array) -> Array:
         """K = G M^-1 G^T."""
@@ -80,12 +117,14 @@ class DenseConstraints:
 
     def multipliers(self, q: Array, p: Array, gradient: Array) -> Array:
         """Lambda(q,p) of (4.3); p need not be tangent."""
-        right = self.second(self.w3 * p) - self.jacobian(q) @ (self.w3 * gradient)
+        right = self.second(q, self.w3 * p) - self.jacobian(q) @ (self.w3 * gradient)
         return np.linalg.solve(self.matrix(q), right)
 
     def relative_errors(self, q: Array) -> Array:
-        """(|r| - L)/L of each constraint."""
-        return np.linalg.norm(self.separations(q), axis=1) / self.lengths - 1
+        """(|r| - L)/L of each distance; of a general constraint how far it is from zero, g/|dg/dq|, over 0.1 nm."""
+        distances = np.linalg.norm(self.separations(q), axis=1) / self.lengths - 1
+        rows = self.jacobian(q)[len(self.pairs) :]
+        return np.concatenate([distances, self.g(q)[len(self.pairs) :] / np.linalg.norm(rows, axis=1) / 0.1])
 
     def tangent(self, q: Array, p: Array) -> Array:
         """The momentum p - G^T mu with G M^-1 p = 0, the nearest in the mass-weighted norm."""
@@ -114,8 +153,8 @@ def monitor(
     if kind in ("ConstraintMultipliers", "ConstraintForce", "ConstraintAndAppliedForce", "MultiplierPNorm"):
         lam = c.multipliers(q, p, gradient)
         k = c.matrix(q)
-        # dLambda/dp = K^-1 d(g''(v,v))/dv M^-1; transposed and applied to x:
-        back = 2 * c.w3[:, None] * c.half_derivative_of_second(v).T
+        # dLambda/dp = 2 K^-1 G(v) M^-1; transposed and applied to x:
+        back = 2 * c.w3[:, None] * c.velocity_jacobian(q, v).T
         if kind == "ConstraintMultipliers":
             u = float(np.linalg.norm(lam))
             return u, back @ np.linalg.solve(k, lam) / u
@@ -289,7 +328,7 @@ class DenseStepper:
             p_rho = h / (2 * rho**2) * impulse
             u, u_p = control.u(c, q, p, gradient)
             rest = rho + before - u - u_before if coupled else 0.0
-            if np.all(np.abs(g) < 2 * self.tolerance * c.lengths**2) and abs(rest) < self.tolerance * rho:
+            if np.all(np.abs(c.relative_errors(q_new)) < self.tolerance) and abs(rest) < self.tolerance * rho:
                 break
             new_jacobian = c.jacobian(q_new)
             a_matrix = -h * step_c / rho * (new_jacobian * c.w3) @ jacobian.T
@@ -354,9 +393,15 @@ class Model:
     velocities: Array
     step: float
     add_forces: Callable[[Any], None]
+    general: list[GeneralConstraint] = field(default_factory=list)
 
     def constraints(self) -> DenseConstraints:
-        return DenseConstraints(self.masses, self.pairs, self.lengths)
+        return DenseConstraints(self.masses, self.pairs, self.lengths, self.general)
+
+    def constrain(self, integrator: Any) -> None:
+        """Give an integrator the constraints that a System cannot have."""
+        for c in self.general:
+            integrator.addConstraint(c.expression, c.particles, c.parameters)
 
     def system(self) -> Any:
         import openmm
@@ -497,6 +542,94 @@ def chain() -> Model:
     pairs = [(i, i + 1) for i in range(7)]
     velocities = thermal_velocities(DenseConstraints(masses, pairs, lengths), q.ravel(), 300.0, 8)
     return Model("chain", masses, pairs, lengths, q, velocities, 0.001, forces)
+
+
+def _angle_gradient(x: Any) -> Any:
+    """The derivative of the cosine of the angle at the second of three particles."""
+    a, b = x[0] - x[1], x[2] - x[1]
+    aa, bb, ab = np.sum(a * a), np.sum(b * b), np.sum(a * b)
+    first = b / np.sqrt(aa * bb) - ab / np.sqrt(aa * bb) * a / aa
+    last = a / np.sqrt(aa * bb) - ab / np.sqrt(aa * bb) * b / bb
+    return np.stack([first, -first - last, last])
+
+
+def _distance_gradient(x: Any) -> Any:
+    r = x[0] - x[1]
+    unit = r / np.sqrt(np.sum(r * r))
+    return np.stack([unit, -unit])
+
+
+def general() -> Model:
+    """A chain of four with a fixed angle, whose last member is on a sphere about a particle without mass; a fifth coupled
+    to the others by a plane between them and by a surface that is curved every way."""
+    import openmm
+
+    q = np.array(
+        [[0, 0.1, 0], [0.11, 0.02, 0.01], [0.2, 0.12, 0], [0.33, 0.08, 0.05], [0.4, 0.2, 0.1], [0.1, 0.3, 0.2]]
+    )
+    masses = np.array([12.0, 1.0, 16.0, 14.0, 0.0, 32.0])
+    pairs = [(0, 1), (1, 2), (2, 3)]
+    lengths = np.array([np.linalg.norm(q[i] - q[j]) for i, j in pairs])
+
+    def cosine(x: Any) -> Any:
+        a, b = x[0] - x[1], x[2] - x[1]
+        return np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b))
+
+    def distance(x: Any) -> Any:
+        return np.sqrt(np.sum((x[0] - x[1]) ** 2))
+
+    def surface(x: Any) -> Any:
+        return np.sin(3 * x[0, 0]) * x[1, 1] + x[0, 2] * x[1, 2] ** 2 + 0.7 * x[1, 0] + np.exp(x[0, 1])
+
+    def surface_gradient(x: Any) -> Any:
+        first = [3 * np.cos(3 * x[0, 0]) * x[1, 1], np.exp(x[0, 1]), x[1, 2] ** 2]
+        return np.array([first, [0.7, np.sin(3 * x[0, 0]), 2 * x[0, 2] * x[1, 2]]])
+
+    def plane(x: Any) -> Any:
+        return 0.3 * x[0, 0] + 0.7 * x[1, 0]
+
+    angle, radius, level, height = cosine(q[[0, 1, 2]]), distance(q[[4, 3]]), surface(q[[5, 0]]), plane(q[[2, 5]])
+    constraints = [
+        GeneralConstraint(
+            "(ax*bx+ay*by+az*bz)/sqrt((ax^2+ay^2+az^2)*(bx^2+by^2+bz^2))-cosine;"
+            "ax=x1-x2; ay=y1-y2; az=z1-z2; bx=x3-x2; by=y3-y2; bz=z3-z2",
+            [0, 1, 2],
+            {"cosine": angle},
+            lambda x: cosine(x) - angle,
+            _angle_gradient,
+        ),
+        GeneralConstraint(
+            "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-r",
+            [4, 3],
+            {"r": radius},
+            lambda x: distance(x) - radius,
+            _distance_gradient,
+        ),
+        GeneralConstraint(
+            "sin(3*x1)*y2+z1*z2^2+k*x2+exp(y1)-level",
+            [5, 0],
+            {"level": level, "k": 0.7},
+            lambda x: surface(x) - level,
+            surface_gradient,
+        ),
+        GeneralConstraint(
+            "w*x1+(1-w)*x2-height",
+            [2, 5],
+            {"w": 0.3, "height": height},
+            lambda x: plane(x) - height,
+            lambda x: np.array([[0.3, 0, 0], [0.7, 0, 0]]) + 0 * x,
+        ),
+    ]
+
+    def forces(system: Any) -> None:
+        bond = openmm.CustomBondForce("500*(r-0.3)^2+20*(r-0.3)^4")
+        for i, j in ((0, 3), (1, 5), (3, 5), (2, 5)):
+            bond.addBond(i, j, [])
+        system.addForce(bond)
+
+    c = DenseConstraints(masses, pairs, lengths, constraints)
+    velocities = thermal_velocities(c, q.ravel(), 300.0, 13)
+    return Model("general", masses, pairs, lengths, q, velocities, 0.001, forces, constraints)
 
 
 def ring() -> Model:

@@ -75,10 +75,10 @@ class Rod(DenseConstraints):
     def jacobian(self, q: Array) -> Array:
         return gradient_of(self.g, q)
 
-    def half_derivative_of_second(self, v: Array) -> Array:
+    def velocity_jacobian(self, q: Array, v: Array) -> Array:
         return self.jacobian(v) - self.jacobian(np.zeros_like(v))
 
-    def second(self, v: Array) -> Array:
+    def second(self, q: Array, v: Array) -> Array:
         """g''(v,v): every constraint is a polynomial of degree two, so this is exact."""
         zero = np.zeros_like(v)
         return self.g(v) - 2 * self.g(zero) + self.g(-v)
