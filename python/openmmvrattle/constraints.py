@@ -8,13 +8,13 @@
 0
 
 Every function adds one or more expressions with `VariableStepRattleIntegrator.addConstraint()` and returns what that
-returns: the index of the constraint, or a tuple of indices. With an index, `getExpressionConstraintMultiplier()` gives the
-force that holds the constraint, and `setExpressionConstraintParameter()` changes the value at which it is held, whose
-name each function gives. Lengths are in nm and angles in radians, or Quantities.
+returns: the index of the constraint, or a tuple of indices. With an index, `getExpressionConstraintMultiplier()` gives
+the force that holds the constraint, and `setExpressionConstraintParameter()` changes the value at which it is held,
+whose name each function gives. Lengths are in nm and angles in radians, or Quantities.
 
-The multiplier is the generalised force along the constrained quantity q: the force on a particle is minus the multiplier
-times the gradient of q. A positive multiplier pulls q to smaller values: it stands against something that would make q
-larger.
+The multiplier is the generalised force along the constrained quantity q: the force on a particle is minus the
+multiplier times the gradient of q. A positive multiplier pulls q to smaller values: it stands against something that
+would make q larger.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def fix_angle(
 ) -> int:
     """Fix the angle of three particles, with the second at its corner: the parameter `angle`.
 
-    The angle lies between 0 and pi and is neither, since there it has no direction in which to change. The multiplier is a
-    torque (kJ/mol/rad).
+    The angle lies between 0 and pi and is neither, since there it has no direction in which to change. The multiplier
+    is a torque (kJ/mol/rad).
     """
     value = _number(angle, _ANGLE, "angle")
     if not 0 < value < math.pi:
@@ -97,8 +97,8 @@ def fix_dihedral(
 ) -> int:
     """Fix the dihedral angle of four particles: the parameter `angle`, with the sign of OpenMM's torsion forces.
 
-    Any angle is allowed, plus any multiple of two pi. What is held at zero is the difference from it, which jumps on the
-    opposite side alone, so that there is no trouble at plus or minus pi. The multiplier is a torque (kJ/mol/rad).
+    Any angle is allowed, plus any multiple of two pi. What is held at zero is the difference from it, which jumps on
+    the opposite side alone, so that there is no trouble at plus or minus pi. The multiplier is a torque (kJ/mol/rad).
     """
     return integrator.addConstraint(
         "atan2(sine*cos(angle) - cosine*sin(angle), cosine*cos(angle) + sine*sin(angle));"
@@ -119,8 +119,8 @@ def fix_distance_difference(
 ) -> int:
     """Fix the difference of two distances, that of the first pair minus that of the second: the parameter `difference`.
 
-    The pairs may share a particle, as in the transfer of an atom from one neighbour to another. The multiplier is a force
-    (kJ/mol/nm).
+    The pairs may share a particle, as in the transfer of an atom from one neighbour to another. The multiplier is a
+    force (kJ/mol/nm).
     """
     (a, b), (c, d) = pair1, pair2
     particles = list(dict.fromkeys((a, b, c, d)))
@@ -154,7 +154,7 @@ def fix_to_sphere(
     center: Sequence[float] | unit.Quantity,
     radius: float | unit.Quantity,
 ) -> int:
-    """Keep a particle on a sphere: the same as fix_distance_to_point(), with the parameter `distance` for the radius."""
+    """Keep a particle on a sphere: fix_distance_to_point(), with the parameter `distance` for the radius."""
     return fix_distance_to_point(integrator, particle, center, _positive(radius, "radius"))
 
 
@@ -172,7 +172,7 @@ def fix_to_plane(
     """
     n = _direction(normal, "normal")
     return integrator.addConstraint(
-        _PLANE, [particle], _point(point, "point") | dict(zip(("nx", "ny", "nz"), n.tolist()))
+        _PLANE, [particle], _point(point, "point") | dict(zip(("nx", "ny", "nz"), n.tolist(), strict=True))
     )
 
 
@@ -260,7 +260,7 @@ def _vector(value: Sequence[float] | unit.Quantity, target: unit.Unit, name: str
 
 
 def _point(value: Sequence[float] | unit.Quantity, name: str) -> dict[str, float]:
-    return dict(zip(("px", "py", "pz"), _vector(value, _LENGTH, name).tolist()))
+    return dict(zip(("px", "py", "pz"), _vector(value, _LENGTH, name).tolist(), strict=True))
 
 
 def _direction(value: Sequence[float], name: str) -> np.ndarray:

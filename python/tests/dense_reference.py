@@ -42,8 +42,8 @@ KINDS = (
 class GeneralConstraint:
     """A constraint g = 0 as the plugin gets it, and once more in NumPy.
 
-    value and gradient take the positions of the particles (n x 3), which may be complex: derivatives along a direction v
-    are the imaginary part at q + i 1e-30 v, exact to rounding.
+    value and gradient take the positions of the particles (n x 3), which may be complex: derivatives along a direction
+    v are the imaginary part at q + i 1e-30 v, exact to rounding.
     """
 
     expression: str
@@ -84,7 +84,7 @@ class DenseConstraints:
         return np.concatenate([distances, [c.value(q.reshape(-1, 3)[c.particles]) for c in self.general]])
 
     def _general_rows(self, gradients: list[Array]) -> Array:
-        """The rows of the general constraints, from the derivatives with respect to their own particles; 0 for anchors."""
+        """The rows of the general constraints, from the derivatives by their own particles; 0 for anchors."""
         rows = np.zeros((len(self.general), self.masses.size, 3))
         for row, c, gradient in zip(rows, self.general, gradients, strict=True):
             row[c.particles] = gradient
@@ -560,8 +560,8 @@ def _distance_gradient(x: Any) -> Any:
 
 
 def general() -> Model:
-    """A chain of four with a fixed angle, whose last member is on a sphere about a particle without mass; a fifth coupled
-    to the others by a plane between them and by a surface that is curved every way."""
+    """A chain of four with a fixed angle, whose last member is on a sphere about a particle without mass; a fifth
+    coupled to the others by a plane between them and by a surface that is curved every way."""
     import openmm
 
     q = np.array(
