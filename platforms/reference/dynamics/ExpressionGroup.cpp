@@ -12,14 +12,6 @@ using OpenMM::Vec3;
 using std::string;
 using std::vector;
 
-namespace {
-
-// How many constraints are evaluated at once: enough to pay for going through the operations, and few enough that what they
-// work on stays in the processor's nearest memory.
-const int MAX_BLOCK_SIZE = 64;
-
-} // namespace
-
 ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParticles((int) example.particles.size()) {
     const char* const axes[] = {"x", "y", "z"};
     for (int i = 0; i < 3 * numParticles; i++)
@@ -67,6 +59,17 @@ ExpressionGroup::Program& ExpressionGroup::require(Program& program, const vecto
     return program;
 }
 
+// Where the inputs index, index + 1, index + 2 of a program go; whether any of them is needed.
+bool ExpressionGroup::findInputs(ArrayExpression& program, int index, double** inputs) {
+    bool isAnyUsed = false;
+    for (int j = 0; j < 3; j++) {
+        const bool isUsed = program.usesInput(index + j);
+        inputs[j] = isUsed ? program.getInput(index + j) : unusedInput;
+        isAnyUsed |= isUsed;
+    }
+    return isAnyUsed;
+}
+
 // Run a program on all constraints, block by block, and call store(first, count) after each.
 template <class Store>
 void ExpressionGroup::run(ArrayExpression& program, const vector<Vec3>& q, const vector<Vec3>* v, const Store& store) {
@@ -75,20 +78,24 @@ void ExpressionGroup::run(ArrayExpression& program, const vector<Vec3>& q, const
         const int count = std::min(MAX_BLOCK_SIZE, getNumConstraints() - first);
         const int* block = &particles[(size_t) first * numParticles];
         const char* moving = &isMoving[(size_t) first * numParticles];
-        for (int i = 0; i < numCoordinates; i++) {
-            if (program.usesInput(i)) {
-                double* input = program.getInput(i);
-                for (int n = 0; n < count; n++)
-                    input[n] = q[block[n * numParticles + i / 3]][i % 3];
-            }
-            // A particle without mass stays where it is, whatever velocity it has been given.
-            if (program.usesInput(numCoordinates + i)) {
-                double* input = program.getInput(numCoordinates + i);
+        for (int p = 0; p < numParticles; p++) {
+            double* x[3];
+            if (findInputs(program, 3 * p, x))
                 for (int n = 0; n < count; n++) {
-                    const int place = n * numParticles + i / 3;
-                    input[n] = moving[place] ? (*v)[block[place]][i % 3] : 0.0;
+                    const Vec3& position = q[block[n * numParticles + p]];
+                    x[0][n] = position[0];
+                    x[1][n] = position[1];
+                    x[2][n] = position[2];
                 }
-            }
+            // A particle without mass stays where it is, whatever velocity it has been given.
+            if (findInputs(program, numCoordinates + 3 * p, x))
+                for (int n = 0; n < count; n++) {
+                    const int place = n * numParticles + p;
+                    const Vec3 velocity = moving[place] ? (*v)[block[place]] : Vec3();
+                    x[0][n] = velocity[0];
+                    x[1][n] = velocity[1];
+                    x[2][n] = velocity[2];
+                }
         }
         for (int i = 0; i < numParameters; i++)
             if (program.usesInput(2 * numCoordinates + i)) {

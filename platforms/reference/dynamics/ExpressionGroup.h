@@ -56,8 +56,14 @@ public:
                                   std::vector<OpenMM::Vec3>& jacobian);
 
 private:
+    /**
+     * How many constraints are evaluated at once: enough to pay for going through the operations, and few enough that what they
+     * work on stays in the processor's nearest memory.
+     */
+    static constexpr int MAX_BLOCK_SIZE = 64;
     typedef std::unique_ptr<ArrayExpression> Program;
     Program& require(Program& program, const std::vector<int>& outputs);
+    bool findInputs(ArrayExpression& program, int index, double** inputs);
     template <class Store>
     void run(ArrayExpression& program, const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>* v,
              const Store& store);
@@ -76,6 +82,7 @@ private:
     std::vector<int> indices, firstEntries, particles;
     std::vector<double> parameterValues;
     std::vector<char> isMoving; // as particles
+    double unusedInput[MAX_BLOCK_SIZE]; // what no program reads
 };
 
 } // namespace OpenMMVRattle
