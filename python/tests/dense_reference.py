@@ -110,6 +110,10 @@ class DenseConstraints:
         """g''(v,v)."""
         return self.velocity_jacobian(q, v) @ v
 
+    def sizes(self) -> Array:
+        """What values of g are to be compared with."""
+        return np.concatenate([2 * self.lengths**2, np.full(len(self.general), 0.1)])
+
     def matrix(self, q: Array) -> Array:
         """K = G M^-1 G^T."""
         jacobian = self.jacobian(q)
@@ -328,7 +332,7 @@ class DenseStepper:
             p_rho = h / (2 * rho**2) * impulse
             u, u_p = control.u(c, q, p, gradient)
             rest = rho + before - u - u_before if coupled else 0.0
-            if np.all(np.abs(c.relative_errors(q_new)) < self.tolerance) and abs(rest) < self.tolerance * rho:
+            if np.all(np.abs(g) < self.tolerance * c.sizes()) and abs(rest) < self.tolerance * rho:
                 break
             new_jacobian = c.jacobian(q_new)
             a_matrix = -h * step_c / rho * (new_jacobian * c.w3) @ jacobian.T
