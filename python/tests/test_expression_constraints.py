@@ -339,6 +339,66 @@ def test_velocity_removal_sees_the_constraints() -> None:
         assert q[2] == pytest.approx(q[0], abs=1e-11) and v[2] == pytest.approx(v[0], abs=1e-9)
 
 
+def test_other_integrators_do_not_keep_it() -> None:
+    """What a CompoundIntegrator's other member leaves is brought back onto the constraint, as a start is."""
+    compound = openmm.CompoundIntegrator()
+    ours = make_integrator(0.01)
+    ours.addConstraint(SPHERE, [0], {"r": 1.0})
+    ours.setReferenceMonitorValue(20.0)
+    compound.addIntegrator(ours)
+    compound.addIntegrator(openmm.VerletIntegrator(0.01))
+    context = open_context(particles(2.0, force="20*z"), compound, "Reference")
+    context.setPositions([[0.6, 0, 0.8]])
+    context.setVelocities([[0, 1, 0]])
+    for _ in range(5):
+        compound.setCurrentIntegrator(0)
+        compound.step(3)
+        assert np.linalg.norm(positions_of(context)[0]) == pytest.approx(1, abs=1e-11)
+        speed = np.linalg.norm(velocities_of(context)[0])
+        compound.setCurrentIntegrator(1)
+        compound.step(10)
+        assert abs(np.linalg.norm(positions_of(context)[0]) - 1) > 1e-3
+    # No step had to pull the particle back from where it had no business to be.
+    assert speed < 5
+
+
+def test_a_barostat_moves_it_off() -> None:
+    """A barostat scales coordinates, and a plane in space does not scale with them."""
+    system = particles(*[40.0] * 20)
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.5)
+    for _ in range(20):
+        force.addParticle(0, 0.2, 0.1)
+    system.addForce(force)
+    system.addForce(openmm.MonteCarloBarostat(100, 300, 2))
+    system.setDefaultPeriodicBoxVectors(*(2 * np.eye(3)))
+    integrator = make_integrator(0.002, monitor="AppliedForce")
+    integrator.setReferenceMonitorValue(5.0)
+    for i in range(5):
+        integrator.addConstraint("z1-height", [i], {"height": 1.0 + 0.1 * i})
+    context = open_context(system, integrator, "Reference")
+    q = np.array([[0.4 * (i % 5) + 0.1, 0.4 * (i // 5) + 0.1, 1.0 + 0.1 * i if i < 5 else 0.2] for i in range(20)])
+    context.setPositions(q)
+    context.setVelocitiesToTemperature(300, 1)
+    boxes = set()
+    for _ in range(100):
+        integrator.step(1)
+        boxes.add(context.getState().getPeriodicBoxVolume()._value)
+        np.testing.assert_allclose(positions_of(context)[:5, 2], 1.0 + 0.1 * np.arange(5), rtol=0, atol=1e-11)
+    assert len(boxes) > 5
+
+
+def test_where_nothing_pulls_there_is_no_measure() -> None:
+    """The multiplier of a tangential force on a particle at rest is rounding, and no reference value."""
+    integrator = make_integrator(0.01)
+    integrator.addConstraint("k*(" + SPHERE + ")", [0], {"k": 7.0, "r": 1.3})
+    context = open_context(particles(2.0, force="0.8*x-0.6*z"), integrator, "Reference")
+    context.setPositions(1.3 * np.array([[0.6, 0, 0.8]]))
+    with pytest.raises(openmm.OpenMMException, match="monitor 0 is zero at the first step"):
+        integrator.step(1)
+
+
 # ----------------------------------------------------------------------------------------------- changed in mid-run
 
 

@@ -68,7 +68,7 @@ public:
     /** The value of a monitor at the current state. */
     virtual double getMonitorValue(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator,
                                    int index) = 0;
-    /** The multipliers at the current state, in the System's order. */
+    /** The multipliers at the current state, in the System's order, and those of expressions behind them. */
     virtual std::vector<double> getMultipliers(OpenMM::ContextImpl& context,
                                                const VariableStepRattleIntegrator& integrator) = 0;
     virtual long long getNumForceEvaluations() const = 0;

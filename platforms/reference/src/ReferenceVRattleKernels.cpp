@@ -252,8 +252,15 @@ void ReferenceIntegrateVRattleStepKernel::prepare(ContextImpl& context, const Va
             // A Force has changed the state (a barostat, say).
             isStateChanged = true;
             noteContext();
-            double energy = computeForces(context);
-            dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
+            if (expressions.empty()) { // all others keep the System's constraints
+                const double energy = computeForces(context);
+                dynamics->changeState(*data.positions, *data.velocities, *data.forces, energy);
+            }
+            else {
+                vector<Vec3> positions, forces;
+                const double energy = computeForcesOnConstraints(context, positions, forces);
+                dynamics->changeState(positions, *data.velocities, forces, energy);
+            }
         }
         else if (mustCompareVelocities && differ(*data.velocities, knownVelocities())) {
             if (isContextAhead || !dynamics->changeFrame(*data.velocities)) {
@@ -273,8 +280,16 @@ void ReferenceIntegrateVRattleStepKernel::startAfresh(ContextImpl& context) {
     requireFinite(*data.velocities, masses, "velocity");
     context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
     noteContext();
-    vector<Vec3> positions = *data.positions;
-    bool isProjected = dynamics->projectPositions(positions);
+    vector<Vec3> positions, forces;
+    const double energy = computeForcesOnConstraints(context, positions, forces);
+    dynamics->begin(positions, *data.velocities, forces, energy);
+}
+
+// The Context's positions moved onto the constraints, and the forces there; the Context keeps its positions.
+double ReferenceIntegrateVRattleStepKernel::computeForcesOnConstraints(ContextImpl& context, vector<Vec3>& positions,
+                                                                       vector<Vec3>& forces) {
+    positions = *data.positions;
+    const bool isProjected = dynamics->projectPositions(positions);
     if (isProjected) {
         writeMoving(positions, *data.positions);
         context.computeVirtualSites();
@@ -287,10 +302,10 @@ void ReferenceIntegrateVRattleStepKernel::startAfresh(ContextImpl& context) {
         putBack(context);
         throw;
     }
-    vector<Vec3> forces = *data.forces;
+    forces = *data.forces;
     if (isProjected)
         putBack(context);
-    dynamics->begin(positions, *data.velocities, forces, energy);
+    return energy;
 }
 
 void ReferenceIntegrateVRattleStepKernel::noteContext() {

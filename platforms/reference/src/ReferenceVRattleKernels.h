@@ -51,6 +51,8 @@ private:
     void readParametersOfExpressions(const VariableStepRattleIntegrator& integrator);
     void prepare(OpenMM::ContextImpl& context, const VariableStepRattleIntegrator& integrator, bool forcesInvalid);
     void startAfresh(OpenMM::ContextImpl& context);
+    double computeForcesOnConstraints(OpenMM::ContextImpl& context, std::vector<OpenMM::Vec3>& positions,
+                                      std::vector<OpenMM::Vec3>& forces);
     VRattleDynamics::Memory memoryOf(const VRattleRunState& run, bool isAutomatic) const;
     void takeRestored(OpenMM::ContextImpl& context);
     void startAutomatic(OpenMM::ContextImpl& context);
