@@ -189,6 +189,9 @@ and the size of the step is stepSize/rho. stepSize is thus the step that is take
 (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The default monitor
 is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
 
+For most uses let the integrator choose its steps without a monitor of yours: automatic=True in the constructor, or
+useAutomaticStepControl().
+
 Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are solved
 with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the tolerance or
 the step fails with an exception; and the multipliers, that is the constraint forces, can be read with getMultipliers().
@@ -761,7 +764,7 @@ def getStepDensity(self) -> float:
 def getMonitorValue(self, index: int = 0) -> float:
     r"""
     Get the value U_k(q,p) of a monitor at the current positions and velocities. Before the first step this computes the
-    forces.
+    forces. With automatic step control monitor 1 is that of the last step, and 0 before the first one.
 
     Parameters
     ----------

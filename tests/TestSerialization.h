@@ -62,7 +62,7 @@ struct Trace {
             for (const Vec3& v : vectors)
                 for (int j = 0; j < 3; j++)
                     numbers.push_back(v[j]);
-        for (int k = 0; k < integrator.getNumMonitors(); k++) {
+        for (int k = 0; k < (integrator.isAutomatic() ? 2 : integrator.getNumMonitors()); k++) {
             numbers.push_back(integrator.getReferenceMonitorValue(k));
             numbers.push_back(integrator.getMonitorValue(k));
         }
@@ -93,6 +93,12 @@ inline void assertSameSettings(const Integrator_& expected, const Integrator_& f
     ASSERT_EQUAL(expected.getNormOrder(), found.getNormOrder());
     ASSERT_EQUAL(expected.getMonitorForceGroup(), found.getMonitorForceGroup());
     ASSERT_EQUAL(expected.getNumMonitors(), found.getNumMonitors());
+    ASSERT_EQUAL(expected.isAutomatic(), found.isAutomatic());
+    if (expected.isAutomatic()) {
+        ASSERT_EQUAL(expected.getCalibrationSteps(), found.getCalibrationSteps());
+        for (int i = 0; i < 2; i++)
+            ASSERT_EQUAL(expected.getSetReferenceMonitorValue(i), found.getSetReferenceMonitorValue(i));
+    }
     for (int i = 0; i < expected.getNumMonitors(); i++) {
         Integrator_::MonitorKind kind1, kind2;
         double weight1, weight2, power1, power2;
@@ -122,13 +128,15 @@ inline void changeAllSettings(Integrator_& integrator) {
 }
 
 inline void testXml() {
-    Integrator_ plain(0.002), changed(1), bounded(0.002), unlimited(0.002), fixed(0.002);
+    Integrator_ plain(0.002), changed(1), bounded(0.002), unlimited(0.002), fixed(0.002), automatic(0.002);
     changeAllSettings(changed);
     bounded.setMaximumStepSize(0.003);
     unlimited.setMinimumStepSize(0);
     unlimited.setMaximumStepSize(0);
     fixed.clearMonitors();
-    for (Integrator_* integrator : {&plain, &changed, &bounded, &unlimited, &fixed}) {
+    automatic.useAutomaticStepControl(77);
+    automatic.setReferenceMonitorValue(1e3 / 7, 1);
+    for (Integrator_* integrator : {&plain, &changed, &bounded, &unlimited, &fixed, &automatic}) {
         std::unique_ptr<Integrator_> copy = fromXml(toXml(*integrator));
         assertSameSettings(*integrator, *copy);
         std::unique_ptr<Integrator> clone(XmlSerializer::clone<Integrator>(*integrator));
@@ -229,8 +237,10 @@ inline vector<Situation> getSituations() {
 }
 
 // From each situation, the run that is saved, the same Context after other steps, and a Context that never stepped.
-inline void testCheckpoints() {
+inline void testCheckpoints(bool isAutomatic) {
     for (Integrator_::UpdateMethod update : ALL_UPDATES) {
+        if (isAutomatic && update != Integrator_::SemiExplicit)
+            break; // it has an update of its own
         for (const Situation& situation : getSituations()) {
             try {
                 TestSystem t;
@@ -238,6 +248,8 @@ inline void testCheckpoints() {
                 Integrator_ integrator(0.002), fresh(0.001);
                 integrator.setUpdateMethod(update);
                 integrator.addMonitor(Integrator_::AppliedForce);
+                if (isAutomatic)
+                    integrator.useAutomaticStepControl(20);
                 Run run(t, integrator);
                 situation.make(run);
                 const double size = integrator.getStepSize(), density = integrator.getStepDensity();
@@ -673,7 +685,8 @@ inline TestList getSerializationTests() {
     return {
         {"XML", testXml},
         {"bad XML", testBadXml},
-        {"checkpoints", testCheckpoints},
+        {"checkpoints", [] { testCheckpoints(false); }},
+        {"checkpoints with automatic step control", [] { testCheckpoints(true); }},
         {"checkpoint of a rescued step", testCheckpointOfRescuedStep},
         {"checkpoint with a force group as monitor", testCheckpointOfForceGroupMonitor},
         {"counts after loading", testCountsAfterLoading},

@@ -33,6 +33,8 @@ struct VRattleRunState;
  * U_ref (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The
  * default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
  *
+ * For most uses let the integrator choose its steps without a monitor of yours: useAutomaticStepControl().
+ *
  * Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are
  * solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the
  * tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
@@ -244,7 +246,8 @@ public:
     double getStepDensity() const;
     /**
      * Get the value U_k(q,p) of a monitor at the current positions and velocities, in the unit given with its kind.
-     * Before the first step this computes the forces.
+     * Before the first step this computes the forces. With automatic step control monitor 1 is that of the last step, and 0
+     * before the first one.
      *
      * @param index    the index of the monitor
      */
