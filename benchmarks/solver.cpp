@@ -15,9 +15,9 @@
 #include <cstdio>
 #include <fstream>
 #include <limits>
+#include <malloc.h>
 #include <stdexcept>
 #include <string>
-#include <sys/resource.h>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -43,10 +43,10 @@ double seconds() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-long kilobytes() {
-    rusage usage;
-    getrusage(RUSAGE_SELF, &usage);
-    return usage.ru_maxrss;
+// Memory in use, of the C library's allocator.
+double kilobytes() {
+    const struct mallinfo2 info = mallinfo2();
+    return (double) (info.uordblks + info.hblkhd) / 1000;
 }
 
 } // namespace
@@ -69,7 +69,7 @@ int main(int argc, char** argv) {
     const int steps = std::stoi(argv[3]), repeats = std::stoi(argv[4]);
     const auto update = std::string(argv[5]) == "Explicit" ? StepDensity::Explicit : StepDensity::SemiExplicit;
 
-    const long before = kilobytes();
+    const double before = kilobytes();
     const double begin = seconds();
     VRattleDynamics dynamics(masses, constraints);
     const double constructed = seconds();
@@ -112,7 +112,7 @@ int main(int argc, char** argv) {
         error = std::max(error, std::fabs(std::sqrt(r.dot(r)) / c.length - 1));
     }
     std::printf("{\"constraints\": %lld, \"step_seconds\": %.9g, \"setup_seconds\": %.6g, \"start_seconds\": %.6g, "
-                "\"kilobytes\": %ld, \"iterations_per_step\": %.3f, \"error\": %.3g}\n",
+                "\"kilobytes\": %.1f, \"iterations_per_step\": %.3f, \"error\": %.3g}\n",
                 counts[1], best, constructed - begin, begun - constructed, kilobytes() - before,
                 (double) (dynamics.getNumIterations() - iterationsBefore) / steps / repeats, error);
     return 0;
