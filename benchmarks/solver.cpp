@@ -98,7 +98,7 @@ int main(int argc, char** argv) {
                 dynamics.step(std::numeric_limits<double>::infinity());
             while (!dynamics.finish(forces, 0));
     };
-    takeSteps(2);
+    takeSteps(2 + ThreadChoice::TRIAL_LENGTH); // until the number of threads has been chosen
     const long long iterationsBefore = dynamics.getNumIterations();
     double best = std::numeric_limits<double>::infinity();
     for (int repeat = 0; repeat < repeats; repeat++) {

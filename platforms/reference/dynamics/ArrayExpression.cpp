@@ -11,7 +11,7 @@ using namespace OpenMMVRattle;
 using std::vector;
 
 ArrayExpression::ArrayExpression(const ExpressionGraph& graph, const vector<int>& inputs, const vector<int>& outputs,
-                                 int blockSize) : blockSize(blockSize) {
+                                 int blockSize) : blockSize(blockSize), numRegisters(0) {
     const vector<ExpressionGraph::Node>& nodes = graph.getNodes();
     const vector<char> needed = graph.findNeeded(outputs);
     const int numNodes = (int) needed.size(), noRegister = -1;
@@ -23,14 +23,12 @@ ArrayExpression::ArrayExpression(const ExpressionGraph& graph, const vector<int>
                 lastUse[argument] = i;
     for (int output : outputs)
         lastUse[output] = numNodes;
-    int numRegisters = 0;
     for (int input : inputs) {
         const bool isUsed = input < numNodes && needed[input];
         inputRegisters.push_back(isUsed ? numRegisters : noRegister);
         if (isUsed)
             registerOf[input] = numRegisters++;
     }
-    vector<std::pair<int, double>> constants;
     for (int i = 0; i < numNodes; i++)
         if (needed[i] && nodes[i].kind == ExpressionGraph::Constant) {
             constants.emplace_back(numRegisters, nodes[i].value);
@@ -58,18 +56,20 @@ ArrayExpression::ArrayExpression(const ExpressionGraph& graph, const vector<int>
     }
     for (int output : outputs)
         outputRegisters.push_back(registerOf[output]);
-    values.resize((size_t) numRegisters * blockSize);
-    for (const auto& constant : constants)
-        std::fill_n(&values[(size_t) constant.first * blockSize], blockSize, constant.second);
 }
 
-void ArrayExpression::evaluate(int count) {
+void ArrayExpression::prepare(double* work) const {
+    for (const auto& constant : constants)
+        std::fill_n(work + (size_t) constant.first * blockSize, blockSize, constant.second);
+}
+
+void ArrayExpression::evaluate(double* work, int count) const {
     static const std::map<std::string, double> noVariables;
     for (const Instruction& instruction : instructions) {
-        double* __restrict result = &values[(size_t) instruction.result * blockSize];
-        const double* a = &values[(size_t) instruction.arguments[0] * blockSize];
-        const double* b = &values[(size_t) instruction.arguments[1] * blockSize];
-        const double* c = &values[(size_t) instruction.arguments[2] * blockSize];
+        double* __restrict result = work + (size_t) instruction.result * blockSize;
+        const double* a = work + (size_t) instruction.arguments[0] * blockSize;
+        const double* b = work + (size_t) instruction.arguments[1] * blockSize;
+        const double* c = work + (size_t) instruction.arguments[2] * blockSize;
         switch (instruction.kind) {
         case ExpressionGraph::Add:
             for (int i = 0; i < count; i++)

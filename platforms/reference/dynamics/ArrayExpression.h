@@ -5,7 +5,9 @@
 #define OPENMMVRATTLE_ARRAYEXPRESSION_H_
 
 #include "ExpressionGraph.h"
+#include <cstddef>
 #include <memory>
+#include <utility>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -27,19 +29,25 @@ public:
      */
     ArrayExpression(const ExpressionGraph& graph, const std::vector<int>& inputs, const std::vector<int>& outputs,
                     int blockSize);
+    /** The number of numbers that a computation works on. Each thread has its own. */
+    size_t getWorkSize() const {
+        return (size_t) numRegisters * blockSize;
+    }
+    /** Write what is the same for all blocks. */
+    void prepare(double* work) const;
     /** Whether an input is needed. */
     bool usesInput(int index) const {
         return inputRegisters[index] >= 0;
     }
     /** Where the values of an input that is needed are to be written. */
-    double* getInput(int index) {
-        return &values[(size_t) inputRegisters[index] * blockSize];
+    double* getInput(double* work, int index) const {
+        return work + (size_t) inputRegisters[index] * blockSize;
     }
     /** Compute the outputs for the first values of the block. */
-    void evaluate(int count);
+    void evaluate(double* work, int count) const;
     /** The values of an output, until the next evaluation. */
-    const double* getOutput(int index) const {
-        return &values[(size_t) outputRegisters[index] * blockSize];
+    const double* getOutput(const double* work, int index) const {
+        return work + (size_t) outputRegisters[index] * blockSize;
     }
     /** The number of operations for each value of a block. */
     int getNumOperations() const {
@@ -52,10 +60,10 @@ private:
         int result, arguments[3]; // registers
         std::shared_ptr<const Lepton::Operation> operation;
     };
-    int blockSize;
+    int blockSize, numRegisters;
     std::vector<Instruction> instructions;
     std::vector<int> inputRegisters, outputRegisters;
-    std::vector<double> values; // one block for each register
+    std::vector<std::pair<int, double>> constants; // registers and what they hold
 };
 
 } // namespace OpenMMVRattle

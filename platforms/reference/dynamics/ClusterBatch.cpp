@@ -100,6 +100,9 @@ public:
         }
         return std::min(numClusters, (first + PACK_SIZE - 1) / PACK_SIZE * PACK_SIZE);
     }
+    int getFirstConstraint(int cluster) const override {
+        return firstConstraint + cluster * B;
+    }
     double solvePositions(const StepArrays& step, int first, int end, double tolerance, int& iterations) const override;
     double coupledPass(const StepArrays& step, int first, int end) const override;
     double finish(const OnStepArrays& step, int first, int end) const override;
@@ -122,7 +125,7 @@ private:
         for (int lane = 0; lane < PACK_SIZE; lane++) {
             int c = std::min(cluster + lane, end - 1);
             lanes.particle[lane] = &particles[(size_t) c * P];
-            lanes.constraint[lane] = firstConstraint + c * B;
+            lanes.constraint[lane] = getFirstConstraint(c);
         }
         return lanes;
     }

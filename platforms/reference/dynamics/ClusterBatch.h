@@ -58,6 +58,8 @@ public:
      * order of their first particles.
      */
     virtual int findCluster(int particle) const = 0;
+    /** The first constraint of a cluster in the internal order. */
+    virtual int getFirstConstraint(int cluster) const = 0;
     /**
      * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by chord iterations, each cluster as
      * many as it needs.

@@ -19,8 +19,11 @@ namespace {
 
 // The number of particles of a block, whose positions, velocities and forces take 150 kB.
 const int BLOCK_SIZE = 1024;
-// The number of constraints that a part of the general clusters is filled up to.
+// The number of constraints that a part of the general clusters is filled up to, and that a piece of a large cluster has.
 const int PART_SIZE = 1000;
+// Clusters are cut from this number of constraints on. The pieces of a chain have twice the entries of L, so that cutting
+// pays where the work can be shared, or does not stay in the processor's caches anyway.
+const int MIN_CUT_SIZE = 20000;
 
 std::string listParticles(const vector<int>& particles) {
     const size_t maxListed = 12;
@@ -53,9 +56,11 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
         vector<int> constraints, particles;
     };
     std::map<Shape, vector<Member>> shapes;
-    vector<vector<int>> general;
+    vector<GeneralCluster> general;
     vector<char> isInBatch(masses.size(), false);
-    for (vector<int>& cluster : findClusters(given)) {
+    vector<int> all(given.getSize());
+    std::iota(all.begin(), all.end(), 0);
+    for (vector<int>& cluster : findClusters(given, all)) {
         vector<DistanceConstraint> members;
         bool mayBeInBatch = true;
         for (int k : cluster) {
@@ -64,8 +69,7 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
                 members.push_back(distances[k]);
         }
         if (!mayBeInBatch || !ClusterBatch::isSupported(members)) {
-            orderForElimination(given, cluster);
-            general.push_back(cluster);
+            general.push_back(cutAndOrder(given, cluster));
             continue;
         }
         vector<int> order, particles, arranged;
@@ -90,23 +94,36 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
         const int first = (int) constraints.size(), numBonds = (int) shape.lengths.size();
         vector<int> particles;
         for (const Member& member : members) {
-            appendCluster(given, member.constraints);
+            clusters.push_back({(int) constraints.size(), numBonds});
+            append(given, member.constraints);
             particles.insert(particles.end(), member.particles.begin(), member.particles.end());
         }
         batches.push_back(ClusterBatch::create(numBonds, numBonds == 3 && shape.numParticles == 3, shape.inverseMasses,
                                                shape.lengths, particles, first));
     }
     firstGeneral = (int) constraints.size();
-    auto hasNoExpression = [&](const vector<int>& cluster) {
-        return std::none_of(cluster.begin(), cluster.end(), [&](int k) { return given.isExpression(k); });
+    auto isDistance = [&](int k) { return !given.isExpression(k); };
+    auto hasNoExpression = [&](const GeneralCluster& cluster) {
+        return std::all_of(cluster.joints.begin(), cluster.joints.end(), isDistance) &&
+               std::all_of(cluster.pieces.begin(), cluster.pieces.end(), [&](const ClusterCut::Piece& piece) {
+                   return std::all_of(piece.constraints.begin(), piece.constraints.end(), isDistance);
+               });
     };
     std::stable_partition(general.begin(), general.end(), hasNoExpression);
-    for (const vector<int>& cluster : general)
-        appendCluster(given, cluster);
+    for (const GeneralCluster& cluster : general) {
+        const int first = getNumConstraints();
+        for (const ClusterCut::Piece& piece : cluster.pieces)
+            append(given, piece.constraints);
+        append(given, cluster.joints);
+        clusters.push_back({first, getNumConstraints() - first});
+    }
     groupExpressions(given);
     findStretches();
+    findParts(general);
+    findGroupRanges();
+    findJointEnds();
     findCouplings();
-    findParts(isInBatch);
+    findFreeParticles(isInBatch);
     findBlocks();
     isFreeToTranslate =
         expressions.empty() && std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
@@ -140,24 +157,31 @@ vector<int> ConstraintSystem::findMovingParticles(const Given& given, int k) con
 }
 
 // Constraints that share a moving particle belong to one cluster (union-find over the particles).
-vector<vector<int>> ConstraintSystem::findClusters(const Given& given) const {
-    vector<int> parent(masses.size());
+vector<vector<int>> ConstraintSystem::findClusters(const Given& given, const vector<int>& members) const {
+    vector<int> particles;
+    for (int k : members)
+        for (int i : findMovingParticles(given, k))
+            particles.push_back(i);
+    std::sort(particles.begin(), particles.end());
+    particles.erase(std::unique(particles.begin(), particles.end()), particles.end());
+    vector<int> parent(particles.size());
     std::iota(parent.begin(), parent.end(), 0);
-    auto find = [&](int i) {
+    auto find = [&](int particle) {
+        int i = (int) (std::lower_bound(particles.begin(), particles.end(), particle) - particles.begin());
         while (parent[i] != i) {
             parent[i] = parent[parent[i]];
             i = parent[i];
         }
         return i;
     };
-    for (int k = 0; k < given.getSize(); k++) {
+    for (int k : members) {
         const vector<int> moving = findMovingParticles(given, k);
         for (size_t i = 1; i < moving.size(); i++)
             parent[find(moving[0])] = find(moving[i]);
     }
-    vector<int> clusterOfRoot(masses.size(), -1);
+    vector<int> clusterOfRoot(particles.size(), -1);
     vector<vector<int>> result;
-    for (int k = 0; k < given.getSize(); k++) {
+    for (int k : members) {
         const vector<int> moving = findMovingParticles(given, k);
         if (moving.empty())
             continue;
@@ -169,6 +193,75 @@ vector<vector<int>> ConstraintSystem::findClusters(const Given& given) const {
         result[cluster].push_back(k);
     }
     return result;
+}
+
+// Cut a cluster that is large, and put its constraints in the order in which they are eliminated.
+ConstraintSystem::GeneralCluster ConstraintSystem::cutAndOrder(const Given& given, const vector<int>& cluster) const {
+    vector<vector<int>> particlesOf;
+    for (int k : cluster)
+        particlesOf.push_back(findMovingParticles(given, k));
+    ClusterCut cut;
+    if ((int) cluster.size() >= MIN_CUT_SIZE)
+        cut = cutCluster(particlesOf, PART_SIZE);
+    if (cut.pieces.empty()) {
+        ClusterCut::Piece whole;
+        whole.constraints = cluster;
+        for (const vector<int>& particles : particlesOf)
+            whole.particles.insert(whole.particles.end(), particles.begin(), particles.end());
+        std::sort(whole.particles.begin(), whole.particles.end());
+        whole.particles.erase(std::unique(whole.particles.begin(), whole.particles.end()), whole.particles.end());
+        orderForElimination(given, whole.constraints);
+        return {{whole}, {}};
+    }
+    GeneralCluster result = {std::move(cut.pieces), std::move(cut.joints)};
+    for (int& k : result.joints)
+        k = cluster[k];
+    for (ClusterCut::Piece& piece : result.pieces) {
+        for (int& k : piece.constraints)
+            k = cluster[k];
+        orderPiece(given, piece.constraints);
+    }
+    orderJoints(given, result);
+    return result;
+}
+
+// As orderForElimination(), for constraints that need not be joined.
+void ConstraintSystem::orderPiece(const Given& given, vector<int>& piece) const {
+    vector<int> ordered;
+    for (vector<int>& joined : findClusters(given, piece)) {
+        orderForElimination(given, joined);
+        ordered.insert(ordered.end(), joined.begin(), joined.end());
+    }
+    piece.swap(ordered);
+}
+
+// When the pieces have been eliminated, the joints at the ends of each are coupled.
+void ConstraintSystem::orderJoints(const Given& given, GeneralCluster& cluster) const {
+    std::map<int, int> pieceOf; // of the particles at joints
+    for (int k : cluster.joints)
+        for (int i : findMovingParticles(given, k))
+            pieceOf[i] = -1;
+    for (size_t p = 0; p < cluster.pieces.size(); p++)
+        for (int i : cluster.pieces[p].particles) {
+            const auto found = pieceOf.find(i);
+            if (found != pieceOf.end())
+                found->second = (int) p;
+        }
+    vector<std::set<int>> jointsOf(cluster.pieces.size());
+    for (size_t place = 0; place < cluster.joints.size(); place++)
+        for (int i : findMovingParticles(given, cluster.joints[place]))
+            jointsOf[pieceOf[i]].insert((int) place);
+    std::set<std::pair<int, int>> entries;
+    for (const std::set<int>& joints : jointsOf)
+        for (int a : joints)
+            for (int b : joints)
+                if (a > b)
+                    entries.emplace(a, b);
+    const vector<int> order = findEliminationOrder((int) cluster.joints.size(), {entries.begin(), entries.end()});
+    vector<int> ordered;
+    for (int place : order)
+        ordered.push_back(cluster.joints[place]);
+    cluster.joints.swap(ordered);
 }
 
 /*
@@ -284,9 +377,8 @@ vector<int> ConstraintSystem::walkThroughConstraints(const Given& given, const v
     return order;
 }
 
-void ConstraintSystem::appendCluster(const Given& given, const vector<int>& cluster) {
-    clusters.push_back({(int) constraints.size(), (int) cluster.size()});
-    for (int k : cluster) {
+void ConstraintSystem::append(const Given& given, const vector<int>& members) {
+    for (int k : members) {
         constraints.push_back(given.isExpression(k) ? DistanceConstraint{-1, -1, 1.0} : given.distances[k]);
         givenIndex.push_back(k);
     }
@@ -294,15 +386,15 @@ void ConstraintSystem::appendCluster(const Given& given, const vector<int>& clus
 
 // Give every expression its entries of a Jacobian and put it into the group of its like.
 void ConstraintSystem::groupExpressions(const Given& given) {
-    vector<int> constraintOf(given.getSize(), -1);
-    for (int k = 0; k < getNumConstraints(); k++)
-        constraintOf[givenIndex[k]] = k;
+    placeInGroups.resize(expressions.size());
     typedef std::tuple<std::string, size_t, vector<std::string>> Kind;
     std::map<Kind, int> groupOf;
     vector<int> groupSizes;
-    for (int e = 0; e < (int) expressions.size(); e++) {
-        const ExpressionConstraint& c = expressions[e];
-        const int k = constraintOf[numGivenDistances + e], firstEntry = getNumEntries();
+    for (int k = 0; k < getNumConstraints(); k++) {
+        if (!isExpression(k))
+            continue;
+        const int e = givenIndex[k] - numGivenDistances, firstEntry = getNumEntries();
+        const ExpressionConstraint& c = given.getExpression(givenIndex[k]);
         for (int i : c.particles)
             expressionEntries.push_back({k, i});
         expressionRows.push_back({k, firstEntry, getNumEntries()});
@@ -316,7 +408,7 @@ void ConstraintSystem::groupExpressions(const Given& given) {
             groupSizes.push_back(0);
         }
         groups[group]->add(c, k, firstEntry, inverseMasses);
-        placeInGroups.emplace_back(group, groupSizes[group]++);
+        placeInGroups[e] = {group, groupSizes[group]++};
     }
 }
 
@@ -348,7 +440,7 @@ std::string ConstraintSystem::describe(int index) const {
 std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobian) const {
     if (!isExpression(index))
         return "";
-    const ExpressionRow& row = expressionRows[givenIndex[index] - numGivenDistances];
+    const ExpressionRow& row = findRow(index);
     double square = 0;
     for (int entry = row.first; entry < row.end; entry++)
         square += jacobian[entry].dot(jacobian[entry]);
@@ -362,29 +454,109 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
                   "where it holds");
 }
 
-// The general clusters in parts, with their particles; and the particles without constraints.
-void ConstraintSystem::findParts(const vector<char>& isInBatch) {
-    vector<char> isGeneral(masses.size(), false);
-    for (int c = 0; c < (int) clusters.size(); c++) {
-        const Cluster& cluster = clusters[c];
-        if (cluster.first < firstGeneral)
+// The general clusters in parts, with their particles.
+void ConstraintSystem::findParts(const vector<GeneralCluster>& general) {
+    Part open = {firstGeneral, firstGeneral, 0, 0, 0, 0, 0, 0, 0, 0, NONE};
+    auto beginNext = [&]() {
+        open.first = open.end;
+        open.firstRow = open.endRow;
+        open.firstParticle = open.endParticle;
+    };
+    auto extend = [&](const vector<int>& members, const vector<int>& particles) {
+        open.end += (int) members.size();
+        while (open.endRow < (int) expressionRows.size() && expressionRows[open.endRow].constraint < open.end)
+            open.endRow++;
+        generalParticles.insert(generalParticles.end(), particles.begin(), particles.end());
+        open.endParticle = (int) generalParticles.size();
+    };
+    auto closePart = [&]() {
+        if (open.end > open.first)
+            generalParts.push_back(open);
+        beginNext();
+    };
+    for (const GeneralCluster& cluster : general) {
+        if (cluster.pieces.size() == 1) {
+            extend(cluster.pieces[0].constraints, cluster.pieces[0].particles);
+            if (open.end - open.first >= PART_SIZE)
+                closePart();
             continue;
-        bool hasExpressions = false;
-        for (int k = cluster.first; k < cluster.first + cluster.size; k++)
-            hasExpressions = hasExpressions || isExpression(k);
-        const bool isLastOpen = !generalParts.empty() && generalParts.back().hasExpressions == hasExpressions &&
-                                (hasExpressions || generalParts.back().end - generalParts.back().first < PART_SIZE);
-        const int numParticles = (int) generalParticles.size();
-        if (!isLastOpen)
-            generalParts.push_back({cluster.first, cluster.first, hasExpressions, numParticles, numParticles});
-        for (int i : getClusterParticles(c))
-            if (inverseMasses[i] > 0) {
-                isGeneral[i] = true;
-                generalParticles.push_back(i);
-            }
-        generalParts.back().end = cluster.first + cluster.size;
-        generalParts.back().endParticle = (int) generalParticles.size();
+        }
+        closePart();
+        CutCluster cut;
+        cut.firstPiece = (int) pieces.size();
+        for (const ClusterCut::Piece& piece : cluster.pieces) {
+            extend(piece.constraints, piece.particles);
+            pieces.push_back(open);
+            pieces.back().piece = (int) pieces.size() - 1;
+            beginNext();
+        }
+        cut.endPiece = (int) pieces.size();
+        extend(cluster.joints, {});
+        cut.joints = open;
+        cutClusters.push_back(cut);
+        beginNext();
     }
+    closePart();
+}
+
+// The expressions of each part by their groups.
+void ConstraintSystem::findGroupRanges() {
+    for (size_t group = 0; group < groups.size(); group++)
+        groupRanges.push_back({(int) group, 0, groups[group]->getNumConstraints()});
+    auto addRangesOf = [&](Part& part) {
+        std::map<int, GroupRange> ranges;
+        for (int r = part.firstRow; r < part.endRow; r++) {
+            const std::pair<int, int>& place =
+                placeInGroups[givenIndex[expressionRows[r].constraint] - numGivenDistances];
+            // Constraints are in their group in internal order too.
+            ranges.emplace(place.first, GroupRange{place.first, place.second, place.second}).first->second.end =
+                place.second + 1;
+        }
+        part.firstGroupRange = (int) groupRanges.size();
+        for (const auto& range : ranges)
+            groupRanges.push_back(range.second);
+        part.endGroupRange = (int) groupRanges.size();
+    };
+    for (Part& part : generalParts)
+        addRangesOf(part);
+    for (Part& piece : pieces)
+        addRangesOf(piece);
+    for (CutCluster& cut : cutClusters)
+        addRangesOf(cut.joints);
+}
+
+// What the joints do to the particles of each piece.
+void ConstraintSystem::findJointEnds() {
+    vector<int> pieceOf(cutClusters.empty() ? 0 : masses.size(), -1);
+    for (const Part& piece : pieces)
+        for (int p = piece.firstParticle; p < piece.endParticle; p++)
+            pieceOf[generalParticles[p]] = piece.piece;
+    vector<vector<JointEnd>> endsOf(pieces.size());
+    auto add = [&](const JointEnd& end) {
+        if (inverseMasses[end.particle] > 0)
+            endsOf[pieceOf[end.particle]].push_back(end);
+    };
+    for (const CutCluster& cut : cutClusters) {
+        for (int k = cut.joints.first; k < cut.joints.end; k++)
+            if (!isExpression(k)) {
+                add({k, k, constraints[k].particle1, 1.0});
+                add({k, k, constraints[k].particle2, -1.0});
+            }
+        for (int r = cut.joints.firstRow; r < cut.joints.endRow; r++)
+            for (int entry = expressionRows[r].first; entry < expressionRows[r].end; entry++)
+                add({entry, expressionRows[r].constraint, getParticleOf(entry), 1.0});
+    }
+    for (Part& piece : pieces) {
+        piece.firstJointEnd = (int) jointEnds.size();
+        jointEnds.insert(jointEnds.end(), endsOf[piece.piece].begin(), endsOf[piece.piece].end());
+        piece.endJointEnd = (int) jointEnds.size();
+    }
+}
+
+void ConstraintSystem::findFreeParticles(const vector<char>& isInBatch) {
+    vector<char> isGeneral(masses.size(), false);
+    for (int i : generalParticles)
+        isGeneral[i] = true;
     for (int i = 0; i < getNumParticles(); i++)
         if (inverseMasses[i] > 0 && !isInBatch[i] && !isGeneral[i])
             freeParticles.push_back(i);
@@ -397,6 +569,7 @@ void ConstraintSystem::findBlocks() {
             block.clusters.push_back(batch->findCluster(particle));
         const auto place = std::lower_bound(freeParticles.begin(), freeParticles.end(), particle);
         block.freeParticle = (int) (place - freeParticles.begin());
+        block.particle = std::min(particle, getNumParticles());
         blocks.push_back(block);
     }
 }
@@ -432,9 +605,17 @@ void ConstraintSystem::findCouplings() {
                     std::swap(row, column);
                 couplings.push_back({row, column, ends[p][a].sign * ends[p][b].sign * inverseMasses[p]});
             }
+    // Those of a joint with a piece belong to the piece.
+    auto partOf = [&](const Coupling& coupling) {
+        const int column = getConstraintOf(coupling.column);
+        const auto piece = std::upper_bound(pieces.begin(), pieces.end(), column,
+                                            [](int k, const Part& part) { return k < part.first; });
+        const bool isInPiece = piece != pieces.begin() && column < (piece - 1)->end;
+        return isInPiece ? (piece - 1)->first : getConstraintOf(coupling.row);
+    };
     std::stable_sort(couplings.begin(), couplings.end(), [&](const Coupling& a, const Coupling& b) {
-        const int rowA = getConstraintOf(a.row), rowB = getConstraintOf(b.row);
-        return rowA != rowB ? rowA < rowB : getConstraintOf(a.column) < getConstraintOf(b.column);
+        return std::make_tuple(partOf(a), getConstraintOf(a.row), getConstraintOf(a.column)) <
+               std::make_tuple(partOf(b), getConstraintOf(b.row), getConstraintOf(b.column));
     });
 }
 
@@ -463,13 +644,33 @@ double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<doub
 
 // Do something for each distance constraint of a part.
 template <class Task> void ConstraintSystem::forDistances(const Part& part, const Task& task) const {
-    for (const Stretch& stretch : distanceStretches) {
-        if (stretch.first >= part.end)
-            break;
-        const int end = std::min(part.end, stretch.end);
-        for (int k = std::max(part.first, stretch.first); k < end; k++)
+    auto stretch = std::upper_bound(distanceStretches.begin(), distanceStretches.end(), part.first,
+                                    [](int k, const Stretch& each) { return k < each.end; });
+    for (; stretch != distanceStretches.end() && stretch->first < part.end; ++stretch) {
+        const int end = std::min(part.end, stretch->end);
+        for (int k = std::max(part.first, stretch->first); k < end; k++)
             task(k);
     }
+}
+
+// Do something for the row of each expression of a part.
+template <class Task> void ConstraintSystem::forRows(const Part& part, const Task& task) const {
+    const int end = std::min(part.endRow, (int) expressionRows.size());
+    for (int r = part.firstRow; r < end; r++)
+        task(expressionRows[r]);
+}
+
+// Do something for the expressions of a part, group by group.
+template <class Task> void ConstraintSystem::forGroups(const Part& part, const Task& task) const {
+    const int end = part.endGroupRange == ALL.endGroupRange ? (int) groups.size() : part.endGroupRange;
+    for (int r = part.firstGroupRange; r < end; r++)
+        task(*groups[groupRanges[r].group], groupRanges[r].first, groupRanges[r].end);
+}
+
+// The row of a constraint that is an expression.
+const ConstraintSystem::ExpressionRow& ConstraintSystem::findRow(int constraint) const {
+    return *std::lower_bound(expressionRows.begin(), expressionRows.end(), constraint,
+                             [](const ExpressionRow& row, int k) { return row.constraint < k; });
 }
 
 double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby,
@@ -485,12 +686,8 @@ double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, cons
         g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
         keepLargest(std::fabs(g[k]));
     });
-    if (part.hasExpressions) {
-        for (const auto& group : groups)
-            group->evaluate(q, g);
-        for (const ExpressionRow& row : expressionRows)
-            keepLargest(findErrorOf(row, g, nearby));
-    }
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) { group.evaluate(q, g, first, end); });
+    forRows(part, [&](const ExpressionRow& row) { keepLargest(findErrorOf(row, g, nearby)); });
     return largest;
 }
 
@@ -514,31 +711,28 @@ void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jac
 
 void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, const Part& part) const {
     evaluateDistanceRows(q, jacobian, part);
-    if (part.hasExpressions)
-        for (const auto& group : groups)
-            group->evaluateJacobian(q, jacobian);
+    forGroups(part,
+              [&](ExpressionGroup& group, int first, int end) { group.evaluateJacobian(q, jacobian, first, end); });
 }
 
 void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, Jacobian& jacobian,
                                                 const Part& part) const {
     evaluateDistanceRows(v, jacobian, part);
-    if (part.hasExpressions)
-        for (const auto& group : groups)
-            group->evaluateVelocityJacobian(q, v, jacobian);
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+        group.evaluateVelocityJacobian(q, v, jacobian, first, end);
+    });
 }
 
 void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result,
                                 const Part& part) const {
     forDistances(
         part, [&](int k) { result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]); });
-    if (!part.hasExpressions)
-        return;
-    for (const ExpressionRow& row : expressionRows) {
+    forRows(part, [&](const ExpressionRow& row) {
         double sum = 0;
         for (int entry = row.first; entry < row.end; entry++)
             sum += jacobian[entry].dot(w[getParticleOf(entry)]);
         result[row.constraint] = sum;
-    }
+    });
 }
 
 void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result,
@@ -547,16 +741,14 @@ void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<V
         int i = constraints[k].particle1, j = constraints[k].particle2;
         result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
     });
-    if (!part.hasExpressions)
-        return;
-    for (const ExpressionRow& row : expressionRows) {
+    forRows(part, [&](const ExpressionRow& row) {
         double sum = 0;
         for (int entry = row.first; entry < row.end; entry++) {
             const int i = getParticleOf(entry);
             sum += jacobian[entry].dot(f[i]) * inverseMasses[i];
         }
         result[row.constraint] = sum;
-    }
+    });
 }
 
 void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result) const {
@@ -577,12 +769,16 @@ void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vec
         result[i] += force * inverseMasses[i];
         result[j] -= force * inverseMasses[j];
     });
-    if (!part.hasExpressions)
-        return;
-    for (size_t e = 0; e < expressionEntries.size(); e++) {
-        const int i = expressionEntries[e].particle;
-        result[i] +=
-            jacobian[getNumConstraints() + e] * (scale * x[expressionEntries[e].constraint] * inverseMasses[i]);
+    forRows(part, [&](const ExpressionRow& row) {
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = getParticleOf(entry);
+            result[i] += jacobian[entry] * (scale * x[row.constraint] * inverseMasses[i]);
+        }
+    });
+    for (int e = part.firstJointEnd; e < part.endJointEnd; e++) {
+        const JointEnd& end = jointEnds[e];
+        result[end.particle] +=
+            jacobian[end.entry] * (end.sign * scale * x[end.constraint] * inverseMasses[end.particle]);
     }
 }
 
@@ -592,9 +788,8 @@ void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec
         Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
         result[k] = w.dot(w) * inverseSquareLengths[k];
     });
-    if (part.hasExpressions)
-        for (const auto& group : groups)
-            group->evaluateCurvature(q, v, result);
+    forGroups(part,
+              [&](ExpressionGroup& group, int first, int end) { group.evaluateCurvature(q, v, result, first, end); });
 }
 
 void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, vector<double>& result) const {

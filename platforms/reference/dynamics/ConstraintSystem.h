@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
+#include "ClusterCut.h"
 #include "ExpressionGroup.h"
 #include "openmm/Vec3.h"
 #include <limits>
@@ -35,8 +36,9 @@ struct DistanceConstraint {
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
  * neighbours: first the small clusters that come in batches of one shape, then the general ones, and of these the ones
- * with an expression last. The functions below work on a part of them: all, or one of getGeneralParts(). Distance
- * constraints between two particles of mass zero cannot move anything and are left out.
+ * with an expression last. The functions below work on a part of them: all, one of getGeneralParts(), one of getPieces() of
+ * the large clusters, or the joints between these. Distance constraints between two particles of mass zero cannot move
+ * anything and are left out.
  */
 class ConstraintSystem {
 public:
@@ -46,16 +48,31 @@ public:
      */
     typedef std::vector<OpenMM::Vec3> Jacobian;
     /**
-     * Whole clusters that are neighbours in the internal order: the constraints first, ..., end - 1. Parts have no particle and no
-     * constraint in common, so that threads may work on them at the same time.
+     * Neighbours in the internal order: the constraints first, ..., end - 1, which are whole clusters, or a piece of a large
+     * one, or the joints between its pieces. Parts that are not joints have no particle and no constraint in common, so that
+     * threads may work on them at the same time.
      */
     struct Part {
         int first, end;
-        bool hasExpressions;              // all expressions are in one part
-        int firstParticle, endParticle;   // of getGeneralParticles()
+        int firstRow, endRow;               // of getExpressionRows()
+        int firstGroupRange, endGroupRange; // the expressions by their groups
+        int firstParticle, endParticle;     // of getGeneralParticles()
+        int firstJointEnd, endJointEnd;     // what joints do to the particles of a piece
+        int piece;                          // in getPieces(), if it is one; else NONE
     };
-    /** All constraints. */
-    static constexpr Part ALL = {0, std::numeric_limits<int>::max(), true, 0, 0};
+    static constexpr int NONE = -1;
+    /** All constraints; with another beginning, all from there on. */
+    static constexpr Part ALL = {0,   std::numeric_limits<int>::max(),
+                                 0,   std::numeric_limits<int>::max(),
+                                 0,   std::numeric_limits<int>::max(),
+                                 0,   0,
+                                 0,   0,
+                                 NONE};
+    /** A large cluster in pieces, of which each is a part, and so are the joints. See ClusterCut. */
+    struct CutCluster {
+        int firstPiece, endPiece; // of getPieces()
+        Part joints;
+    };
     /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
     struct Cluster {
         int first, size;
@@ -67,6 +84,7 @@ public:
     struct Block {
         std::vector<int> clusters; // the first cluster of each batch; a multiple of PACK_SIZE
         int freeParticle;          // the first in getFreeParticles()
+        int particle;              // the first of all
     };
     /**
      * Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column), row and column being
@@ -159,11 +177,18 @@ public:
         return firstGeneral;
     }
     /**
-     * The general clusters in parts, each a few clusters that are worked through together while the processor's caches have
-     * them; those with expressions are one part.
+     * The general clusters that are not cut, in parts: each is a few clusters that are worked through together while the
+     * processor's caches have them.
      */
     const std::vector<Part>& getGeneralParts() const {
         return generalParts;
+    }
+    /** The pieces of all large clusters. */
+    const std::vector<Part>& getPieces() const {
+        return pieces;
+    }
+    const std::vector<CutCluster>& getCutClusters() const {
+        return cutClusters;
     }
     /** The particles with mass whose cluster is in no batch, part by part. */
     const std::vector<int>& getGeneralParticles() const {
@@ -206,7 +231,7 @@ public:
                           const Part& part = ALL) const;
     /** result += G^T x, as forces on the particles. */
     void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
-    /** result += scale M^-1 G^T x. */
+    /** result += scale M^-1 G^T x; for a piece, what all constraints do to its particles. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
                                std::vector<OpenMM::Vec3>& result, const Part& part = ALL) const;
     /** g''(v,v), the second derivative of the constraints along v at q. */
@@ -243,20 +268,43 @@ private:
             return expressions[k - distances.size()];
         }
     };
+    /** A cluster that is in no batch: the constraints of the whole, or of each piece, and the joints. */
+    struct GeneralCluster {
+        std::vector<ClusterCut::Piece> pieces;
+        std::vector<int> joints;
+    };
+    /** Constraints of an expression group that are in one part: the places first, ..., end - 1 in the group. */
+    struct GroupRange {
+        int group, first, end;
+    };
+    /** What a joint does to a particle. */
+    struct JointEnd {
+        int entry, constraint, particle;
+        double sign;
+    };
     std::vector<int> findMovingParticles(const Given& given, int k) const;
-    std::vector<std::vector<int>> findClusters(const Given& given) const;
+    std::vector<std::vector<int>> findClusters(const Given& given, const std::vector<int>& members) const;
     void orderForElimination(const Given& given, std::vector<int>& cluster) const;
     std::vector<int> walkThroughParticles(const Given& given, const std::vector<int>& cluster,
                                           const std::map<int, std::vector<int>>& constraintsOf) const;
     std::vector<int> walkThroughConstraints(const Given& given, const std::vector<int>& cluster,
                                             const std::map<int, std::vector<int>>& constraintsOf) const;
-    void appendCluster(const Given& given, const std::vector<int>& cluster);
+    GeneralCluster cutAndOrder(const Given& given, const std::vector<int>& cluster) const;
+    void orderPiece(const Given& given, std::vector<int>& piece) const;
+    void orderJoints(const Given& given, GeneralCluster& cluster) const;
+    void append(const Given& given, const std::vector<int>& members);
     void groupExpressions(const Given& given);
     void findStretches();
     void findCouplings();
-    void findParts(const std::vector<char>& isInBatch);
+    void findParts(const std::vector<GeneralCluster>& general);
+    void findGroupRanges();
+    void findJointEnds();
+    void findFreeParticles(const std::vector<char>& isInBatch);
     void findBlocks();
     template <class Task> void forDistances(const Part& part, const Task& task) const;
+    template <class Task> void forRows(const Part& part, const Task& task) const;
+    template <class Task> void forGroups(const Part& part, const Task& task) const;
+    const ExpressionRow& findRow(int constraint) const;
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
@@ -269,13 +317,16 @@ private:
     std::vector<ExpressionConstraint> expressions; // in the order of the constructor
     std::vector<std::unique_ptr<ExpressionGroup>> groups;
     std::vector<std::pair<int, int>> placeInGroups; // group and number therein of each expression
-    std::vector<ExpressionRow> expressionRows;
+    std::vector<GroupRange> groupRanges; // first each group as a whole, then those of the parts
+    std::vector<ExpressionRow> expressionRows; // in internal order, and their entries too
     std::vector<ExpressionEntry> expressionEntries;
     std::vector<Cluster> clusters;
     std::vector<Coupling> couplings;
     std::vector<std::unique_ptr<ClusterBatch>> batches;
     std::vector<Block> blocks;
-    std::vector<Part> generalParts;
+    std::vector<Part> generalParts, pieces;
+    std::vector<CutCluster> cutClusters;
+    std::vector<JointEnd> jointEnds;
     std::vector<int> generalParticles, freeParticles;
 };
 

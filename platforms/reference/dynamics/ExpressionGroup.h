@@ -6,8 +6,10 @@
 
 #include "ArrayExpression.h"
 #include "openmm/Vec3.h"
+#include <functional>
 #include <map>
 #include <memory>
+#include <mutex>
 #include <string>
 #include <vector>
 
@@ -22,7 +24,8 @@ struct ExpressionConstraint {
 
 /**
  * The constraints that share an expression, a number of particles and the names of their parameters. The expression is parsed
- * and differentiated once, and evaluated for all of them together.
+ * and differentiated once, and evaluated for those that were added as the first-th, ..., (end - 1)-th together. Several threads may
+ * evaluate different ones at the same time.
  *
  * A constraint of n particles has n neighbouring entries in a Jacobian, one for each particle in the constraint's order. Those
  * of particles without mass are zero.
@@ -41,19 +44,22 @@ public:
      */
     void add(const ExpressionConstraint& constraint, int index, int firstEntry,
              const std::vector<double>& inverseMasses);
+    int getNumConstraints() const {
+        return (int) indices.size();
+    }
     /** Change the parameters of the constraint that was added as the n-th. */
     void setParameters(int n, const std::map<std::string, double>& parameters);
 
     /** g(q) */
-    void evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g);
+    void evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, int first, int end);
     /** The rows of G(q) = dg/dq. */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, std::vector<OpenMM::Vec3>& jacobian);
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, std::vector<OpenMM::Vec3>& jacobian, int first, int end);
     /** g''(v,v) at q. */
     void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                           std::vector<double>& result);
+                           std::vector<double>& result, int first, int end);
     /** The rows (d^2g/dq^2 v)^T at q. */
     void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                                  std::vector<OpenMM::Vec3>& jacobian);
+                                  std::vector<OpenMM::Vec3>& jacobian, int first, int end);
 
 private:
     /**
@@ -62,16 +68,16 @@ private:
      */
     static constexpr int MAX_BLOCK_SIZE = 64;
     typedef std::unique_ptr<ArrayExpression> Program;
-    Program& require(Program& program, const std::vector<int>& outputs);
-    bool findInputs(ArrayExpression& program, int index, double** inputs);
-    template <class Store>
-    void run(ArrayExpression& program, const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>* v,
-             const Store& store);
-    void runRows(ArrayExpression& program, const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>* v,
-                 std::vector<OpenMM::Vec3>& jacobian);
-    int getNumConstraints() const {
-        return (int) indices.size();
-    }
+    /** What a program works on: positions, perhaps velocities, and the constraints first, ..., end - 1. */
+    struct Range {
+        const std::vector<OpenMM::Vec3>& q;
+        const std::vector<OpenMM::Vec3>* v;
+        int first, end;
+    };
+    const ArrayExpression& require(Program& program, const std::function<std::vector<int>()>& findOutputs);
+    template <class Store> void run(const ArrayExpression& program, const Range& range, const Store& store) const;
+    void runValues(const ArrayExpression& program, const Range& range, std::vector<double>& result) const;
+    void runRows(const ArrayExpression& program, const Range& range, std::vector<OpenMM::Vec3>& jacobian) const;
     int numParticles;
     ExpressionGraph graph;
     std::vector<int> coordinates, velocities,
@@ -82,7 +88,7 @@ private:
     std::vector<int> indices, firstEntries, particles;
     std::vector<double> parameterValues;
     std::vector<char> isMoving; // as particles
-    double unusedInput[MAX_BLOCK_SIZE]; // what no program reads
+    std::mutex mutex; // of the making of programs
 };
 
 } // namespace OpenMMVRattle

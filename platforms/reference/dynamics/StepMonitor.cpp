@@ -53,8 +53,9 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 
 StepMonitor::StepMonitor(const ConstraintSystem& system) :
         system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
-        maxForce(0), forcePNorm(0), constraintForceSquared(0), toSolve(system.getNumConstraints()),
-        solved(system.getNumConstraints()), velocityJacobian(system.getNumEntries()) {
+        maxForce(0), forcePNorm(0), constraintForceSquared(0), blockSums(system.getBlocks().size() - 1),
+        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
+        velocityJacobian(system.getNumEntries()) {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms, double order) {
@@ -89,19 +90,34 @@ bool StepMonitor::usesVelocities() const {
 }
 
 void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
+    for (size_t block = 0; block < blockSums.size(); block++)
+        sumForces(newForces, (int) block);
+    finishForces(newForces, energy);
+}
+
+// The force on a particle that does not move is of no interest, even if it is not a number.
+double StepMonitor::squareOf(const Vec3& force, int particle) const {
+    return system.getInverseMasses()[particle] > 0 ? force.dot(force) : 0.0;
+}
+
+void StepMonitor::sumForces(const vector<Vec3>& newForces, int block) {
+    const int first = system.getBlocks()[block].particle, end = system.getBlocks()[block + 1].particle;
+    blockSums[block] = sumOf(end - first, [&](int i) { return squareOf(newForces[first + i], first + i); });
+}
+
+void StepMonitor::finishForces(const vector<Vec3>& newForces, double energy) {
     forces = &newForces;
     groupEnergy = energy;
     appliedForceSquared = forceSquared = maxForce = forcePNorm = 0;
     const vector<double>& inverseMasses = system.getInverseMasses();
     const int numParticles = system.getNumParticles();
-    // The force on a particle that does not move is of no interest, even if it is not a number.
-    auto squareOf = [&](int i) { return inverseMasses[i] > 0 ? newForces[i].dot(newForces[i]) : 0.0; };
+    auto squareOf = [&](int i) { return this->squareOf(newForces[i], i); };
     auto isWanted = [&](std::initializer_list<Kind> kinds) {
         return std::any_of(terms.begin(), terms.end(), [&](const Term& term) {
             return std::find(kinds.begin(), kinds.end(), term.kind) != kinds.end();
         });
     };
-    forceSquared = sumOf(numParticles, squareOf);
+    forceSquared = sumOf((int) blockSums.size(), [&](int block) { return blockSums[block]; });
     if (isWanted({AppliedForce, ConstraintAndAppliedForce}))
         appliedForceSquared = sumOf(numParticles, [&](int i) { return squareOf(i) * inverseMasses[i]; });
     if (isWanted({MaxForce}))

@@ -70,6 +70,12 @@ public:
      * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
      */
     void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * The part of setForces() that concerns a block of particles (ConstraintSystem::getBlocks()), so that threads may share it; when
+     * all have been done, the rest is finishForces().
+     */
+    void sumForces(const std::vector<OpenMM::Vec3>& forces, int block);
+    void finishForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     /** Whether the forces of the last setForces() were all finite. */
     bool hasFiniteForces() const {
         return std::isfinite(forceSquared);
@@ -125,6 +131,7 @@ public:
                           const ConstraintMatrix& matrix, std::vector<OpenMM::Vec3>& gradient);
 
 private:
+    double squareOf(const OpenMM::Vec3& force, int particle) const;
     double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v,
                         const std::vector<double>& multipliers) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
@@ -134,6 +141,7 @@ private:
     double normOrder;
     const std::vector<OpenMM::Vec3>* forces;
     double groupEnergy, appliedForceSquared, forceSquared, maxForce, forcePNorm, constraintForceSquared;
+    std::vector<double> blockSums; // of the squares of the forces
     std::vector<double> toSolve, solved;
     ConstraintSystem::Jacobian velocityJacobian;
 };

@@ -4,6 +4,7 @@
 #include "VRattleDynamics.h"
 #include "Pack.h"
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <limits>
 #include <sstream>
@@ -15,10 +16,9 @@ using std::vector;
 namespace {
 
 const int MAX_CHORD_ITERATIONS = 12, MAX_NEWTON_ITERATIONS = 50;
-// Threads share the batches from this number of constraints on. A pass costs 10 to 25 ns a constraint; a call of the thread
-// pool 6 us if all threads are awake, and ten times that within a run, where they are not (measured: with 6,000 constraints
-// two threads were slower than one, with 24,000 faster).
-const int MIN_PARALLEL_CONSTRAINTS = 12000;
+// Threads may share the work from this number of constraints on. A pass costs 10 to 25 ns a constraint, and a call of the thread
+// pool 5 us at the least.
+const int MIN_PARALLEL_CONSTRAINTS = 2000;
 // If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
 const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 // The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
@@ -50,9 +50,10 @@ double dot(const vector<double>& a, const vector<double>& b) {
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                  const vector<ExpressionConstraint>& expressions) :
         system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
-        automatic(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false), hasHalfStepValue(false),
-        halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor), isMonitorCurrent(false),
-        stepKind(First), rhoNext(1), stepNext(0), kickNext(0), numIterations(0), numRescues(0), lastError(0) {
+        automatic(system), settings(), sharedSeconds(0), groupEnergy(0), rho(1), u(1), hasDensity(false),
+        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor),
+        isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0), numIterations(0), numRescues(0),
+        lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -65,6 +66,7 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
           &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction,
           &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
+    isPieceEliminated.resize(system.getPieces().size());
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(system.getNumEntries());
 }
@@ -179,18 +181,14 @@ void VRattleDynamics::ensureFactor(FactorScope scope) {
     }
     if (factorScope >= scope)
         return;
-    auto evaluatePart = [&](const ConstraintSystem::Part& part) {
-        system.evaluateJacobian(q, jacobian, part);
-        const int failed = matrix.tryToFactorize(jacobian, part);
-        if (failed != ConstraintMatrix::REGULAR)
-            matrix.throwDependent(failed, jacobian);
-        system.multiplyOverMass(jacobian, force, appliedTerm, part);
-    };
-    if (scope == FullFactor)
-        evaluatePart(ConstraintSystem::ALL);
-    else
-        for (const ConstraintSystem::Part& part : system.getGeneralParts())
-            evaluatePart(part);
+    ConstraintSystem::Part part = ConstraintSystem::ALL;
+    if (scope == GeneralFactor)
+        part.first = system.getFirstGeneral();
+    system.evaluateJacobian(q, jacobian, part);
+    const int failed = matrix.tryToFactorize(jacobian, part);
+    if (failed != ConstraintMatrix::REGULAR)
+        matrix.throwDependent(failed, jacobian);
+    system.multiplyOverMass(jacobian, force, appliedTerm, part);
     factorScope = scope;
 }
 
@@ -231,16 +229,24 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                  rightSideHalf.data(),
                                  lambdaRate.data(),
                                  kick};
+    const OnStep state = {positions, halfStep, forces, velocities, multipliers, rightSides, kick, withHalfStep};
     const vector<double>& inverseMasses = system.getInverseMasses();
-    const ShareResult result =
-        runShared([&](const ClusterBatch& batch, int begin, int end,
-                      ShareResult& share) { share.pivot = -larger(-share.pivot, -batch.finish(arrays, begin, end)); },
-                  [&](int i) { velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]); },
-                  [&](const ConstraintSystem::Part& part, ShareResult& share) {
-                      share.failed =
-                          std::max(share.failed, evaluateOnStepGeneral(part, arrays, positions, halfStep, forces,
-                                                                       velocities, multipliers, rightSides));
-                  });
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        system.evaluateJacobian(positions, jacobianNext, cluster.joints); // their rows are in the columns of pieces
+    });
+    ShareResult result = runShared([&](int block) { monitor.sumForces(forces, block); },
+                                   [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
+                                       share.pivot = -larger(-share.pivot, -batch.finish(arrays, begin, end));
+                                   },
+                                   [&](int i) { velocities[i] = halfStep[i] + forces[i] * (kick * inverseMasses[i]); },
+                                   [&](const ConstraintSystem::Part& part, ShareResult& share) {
+                                       share.failed = std::max(share.failed, evaluateOnStepGeneral(state, part));
+                                   },
+                                   [&](const ConstraintSystem::Part& piece, ShareResult& share) {
+                                       share.failed = std::max(share.failed, beginVelocities(state, piece));
+                                   });
+    if (result.failed == ConstraintMatrix::REGULAR)
+        result.failed = evaluateOnStepPieces(state);
     if (result.failed != ConstraintMatrix::REGULAR)
         matrix.throwDependent(result.failed, jacobianNext);
     if (!(result.pivot > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
@@ -248,7 +254,7 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
         system.evaluateJacobian(positions, jacobianNext);
         matrix.factorize(jacobianNext);
     }
-    monitor.setForces(forces, energy);
+    monitor.finishForces(forces, energy);
     if (!monitor.hasFiniteForces())
         throw StepFailure("the force on a particle is infinite or not a number");
     monitor.evaluate(velocities, multipliers, rightSides, monitorValues);
@@ -257,12 +263,58 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
         monitor.evaluate(halfStep, lambdaHalf, rightSideHalf, valuesHalf);
 }
 
-// The same for one part of the clusters that are in no batch; returns what ConstraintMatrix::tryToFactorize() does.
-int VRattleDynamics::evaluateOnStepGeneral(const ConstraintSystem::Part& part, const OnStepArrays& arrays,
-                                           const vector<Vec3>& positions, const vector<Vec3>& halfStep,
-                                           const vector<Vec3>& forces, vector<Vec3>& velocities,
-                                           vector<double>& multipliers, vector<double>& rightSides) {
-    system.evaluateJacobian(positions, jacobianNext, part);
+// The same for clusters that are in no batch and not cut; returns what ConstraintMatrix::tryToFactorize() does.
+int VRattleDynamics::evaluateOnStepGeneral(const OnStep& state, const ConstraintSystem::Part& part) {
+    const int failed = beginVelocities(state, part);
+    if (failed != ConstraintMatrix::REGULAR)
+        return failed;
+    beginMultipliers(state, part);
+    matrix.substitute(state.multipliers, part);
+    if (state.withHalfStep) {
+        matrix.substitute(lambdaHalf, part);
+        beginRates(state, part);
+        matrix.substitute(lambdaRate, part);
+    }
+    return ConstraintMatrix::REGULAR;
+}
+
+// And for those that are cut, after beginVelocities() for all pieces.
+int VRattleDynamics::evaluateOnStepPieces(const OnStep& state) {
+    int failed = ConstraintMatrix::REGULAR;
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        failed = std::max(failed, matrix.tryToFactorizeJoints(jacobianNext, cluster));
+        system.multiply(jacobianNext, state.velocities, correction, cluster.joints);
+        matrix.solveJoints(correction, cluster);
+    });
+    if (failed != ConstraintMatrix::REGULAR)
+        return failed;
+    runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult&) { beginMultipliers(state, piece); });
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        formMultiplierEquations(state, cluster.joints);
+        matrix.solveJoints(state.multipliers, cluster, 0);
+        if (state.withHalfStep)
+            matrix.solveJoints(lambdaHalf, cluster, 1);
+    });
+    runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult&) {
+        matrix.substitute(state.multipliers, piece);
+        if (state.withHalfStep) {
+            matrix.substitute(lambdaHalf, piece);
+            beginRates(state, piece);
+        }
+    });
+    if (!state.withHalfStep)
+        return ConstraintMatrix::REGULAR;
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        formRateEquations(state, cluster.joints);
+        matrix.solveJoints(lambdaRate, cluster);
+    });
+    runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult&) { matrix.substitute(lambdaRate, piece); });
+    return ConstraintMatrix::REGULAR;
+}
+
+// Kick the velocities of a part, and begin to solve for their projection.
+int VRattleDynamics::beginVelocities(const OnStep& state, const ConstraintSystem::Part& part) {
+    system.evaluateJacobian(state.positions, jacobianNext, part);
     const int failed = matrix.tryToFactorize(jacobianNext, part);
     if (failed != ConstraintMatrix::REGULAR)
         return failed;
@@ -270,32 +322,52 @@ int VRattleDynamics::evaluateOnStepGeneral(const ConstraintSystem::Part& part, c
     const vector<int>& particles = system.getGeneralParticles();
     for (int p = part.firstParticle; p < part.endParticle; p++) {
         const int i = particles[p];
-        velocities[i] = halfStep[i] + forces[i] * (arrays.kick * inverseMasses[i]);
+        state.velocities[i] = state.halfStep[i] + state.forces[i] * (state.kick * inverseMasses[i]);
     }
-    system.multiply(jacobianNext, velocities, correction, part);
-    matrix.solve(correction, part);
-    system.addTransposedOverMass(jacobianNext, correction, -1.0, velocities, part);
-    system.multiplyOverMass(jacobianNext, forces, appliedTermNext, part);
-    auto computeMultipliers = [&](const vector<Vec3>& at, vector<double>& right, vector<double>& result) {
-        system.evaluateCurvature(positions, at, right, part);
+    system.multiply(jacobianNext, state.velocities, correction, part);
+    matrix.eliminate(correction, part);
+    return ConstraintMatrix::REGULAR;
+}
+
+// Project the velocities of a part, and begin to solve for the multipliers.
+void VRattleDynamics::beginMultipliers(const OnStep& state, const ConstraintSystem::Part& part) {
+    matrix.substitute(correction, part);
+    system.addTransposedOverMass(jacobianNext, correction, -1.0, state.velocities, part);
+    formMultiplierEquations(state, part);
+    matrix.eliminate(state.multipliers, part, 0);
+    if (state.withHalfStep)
+        matrix.eliminate(lambdaHalf, part, 1);
+}
+
+// K Lambda = g''(v,v) + G M^-1 F (4.3), at the on-step and the half-step velocities.
+void VRattleDynamics::formMultiplierEquations(const OnStep& state, const ConstraintSystem::Part& part) {
+    system.multiplyOverMass(jacobianNext, state.forces, appliedTermNext, part);
+    auto form = [&](const vector<Vec3>& velocities, vector<double>& rightSides, vector<double>& multipliers) {
+        system.evaluateCurvature(state.positions, velocities, rightSides, part);
         for (int k = part.first; k < part.end; k++)
-            result[k] = right[k] += appliedTermNext[k];
-        matrix.solve(result, part);
+            multipliers[k] = rightSides[k] += appliedTermNext[k];
     };
-    computeMultipliers(velocities, rightSides, multipliers);
-    if (arrays.lambdaHalf == nullptr)
-        return ConstraintMatrix::REGULAR;
-    computeMultipliers(halfStep, rightSideHalf, lambdaHalf);
-    // Along dv = M^-1 (F - G^T Lambda), dLambda = 2 K^-1 G(v) dv.
+    form(state.velocities, state.rightSides, state.multipliers);
+    if (state.withHalfStep)
+        form(state.halfStep, rightSideHalf, lambdaHalf);
+}
+
+// Begin to solve for the change of the multipliers along dv = M^-1 (F - G^T Lambda), dLambda = 2 K^-1 G(v) dv.
+void VRattleDynamics::beginRates(const OnStep& state, const ConstraintSystem::Part& part) {
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    const vector<int>& particles = system.getGeneralParticles();
     for (int p = part.firstParticle; p < part.endParticle; p++)
-        acceleration[particles[p]] = forces[particles[p]] * inverseMasses[particles[p]];
-    system.addTransposedOverMass(jacobianNext, multipliers, -1.0, acceleration, part);
-    system.evaluateVelocityJacobian(positions, velocities, velocityJacobian, part);
+        acceleration[particles[p]] = state.forces[particles[p]] * inverseMasses[particles[p]];
+    system.addTransposedOverMass(jacobianNext, state.multipliers, -1.0, acceleration, part);
+    formRateEquations(state, part);
+    matrix.eliminate(lambdaRate, part);
+}
+
+void VRattleDynamics::formRateEquations(const OnStep& state, const ConstraintSystem::Part& part) {
+    system.evaluateVelocityJacobian(state.positions, state.velocities, velocityJacobian, part);
     system.multiply(velocityJacobian, acceleration, lambdaRate, part);
     for (int k = part.first; k < part.end; k++)
         lambdaRate[k] *= 2;
-    matrix.solve(lambdaRate, part);
-    return ConstraintMatrix::REGULAR;
 }
 
 // The change of u along F - G^T Lambda, of the on-step state that is about to be taken over.
@@ -496,25 +568,29 @@ void VRattleDynamics::formHalfStepVelocities() {
 
 void VRattleDynamics::ShareResult::merge(const ShareResult& other) {
     error = larger(error, other.error);
+    pieceError = larger(pieceError, other.pieceError);
     pivot = -larger(-pivot, -other.pivot);
     iterations = std::max(iterations, other.iterations);
     failed = std::max(failed, other.failed);
 }
 
-// Run a task on all batches, block by block: task(batch, first cluster, end, result); another on all particles without
-// constraints, freeTask(particle); and another on the parts of all other clusters, partTask(part, result). Each thread takes its
-// share. A cluster is worked on in the same lane of a pack whatever the number of threads, since blocks begin at whole packs.
-template <class Task, class FreeTask, class PartTask>
-VRattleDynamics::ShareResult VRattleDynamics::runShared(const Task& task, const FreeTask& freeTask,
-                                                        const PartTask& partTask) {
+// Go through all particles block by block, calling blockTask(block), a task for its part of each batch, task(batch, first cluster,
+// end, result), and one for particles without constraints, freeTask(particle); then through the parts of whole clusters,
+// partTask(part, result), and the pieces of those that are cut, pieceTask(piece, result). Each thread takes its share. A cluster is
+// worked on in the same lane of a pack whatever the number of threads, since blocks begin at whole packs.
+template <class BlockTask, class Task, class FreeTask, class PartTask, class PieceTask>
+VRattleDynamics::ShareResult VRattleDynamics::runShared(const BlockTask& blockTask, const Task& task,
+                                                        const FreeTask& freeTask, const PartTask& partTask,
+                                                        const PieceTask& pieceTask) {
     const auto& batches = system.getBatches();
     const auto& blocks = system.getBlocks();
     const auto& parts = system.getGeneralParts();
+    const auto& pieces = system.getPieces();
     const vector<int>& freeParticles = system.getFreeParticles();
-    auto runShare = [&](int thread, int numThreads) {
-        ShareResult result;
+    return runOnThreads([&](int thread, int numThreads, ShareResult& result) {
         const size_t numBlocks = blocks.size() - 1, endBlock = numBlocks * (thread + 1) / numThreads;
         for (size_t b = numBlocks * thread / numThreads; b < endBlock; b++) {
+            blockTask((int) b);
             for (size_t k = 0; k < batches.size(); k++) {
                 const int first = blocks[b].clusters[k], end = blocks[b + 1].clusters[k];
                 if (first < end)
@@ -526,26 +602,65 @@ VRattleDynamics::ShareResult VRattleDynamics::runShared(const Task& task, const 
         const size_t endPart = parts.size() * (thread + 1) / numThreads;
         for (size_t k = parts.size() * thread / numThreads; k < endPart; k++)
             partTask(parts[k], result);
+        const size_t endPiece = pieces.size() * (thread + 1) / numThreads;
+        for (size_t k = pieces.size() * thread / numThreads; k < endPiece; k++)
+            pieceTask(pieces[k], result);
+    });
+}
+
+// Run a task on the pieces of cut clusters: task(piece, result).
+template <class PieceTask> VRattleDynamics::ShareResult VRattleDynamics::runOnPieces(const PieceTask& task) {
+    const auto& pieces = system.getPieces();
+    if (pieces.empty())
+        return ShareResult();
+    return runOnThreads([&](int thread, int numThreads, ShareResult& result) {
+        const size_t endPiece = pieces.size() * (thread + 1) / numThreads;
+        for (size_t k = pieces.size() * thread / numThreads; k < endPiece; k++)
+            task(pieces[k], result);
+    });
+}
+
+// Call share(thread, number of threads, result) on each thread, or once if that is faster.
+template <class Share> VRattleDynamics::ShareResult VRattleDynamics::runOnThreads(const Share& share) {
+    if (!parallel || system.getNumConstraints() < MIN_PARALLEL_CONSTRAINTS) {
+        ShareResult result;
+        share(0, 1, result);
         return result;
-    };
-    const int numShared = parts.size() > 1 ? system.getNumConstraints() : system.getFirstGeneral();
-    if (!parallel || numShared < MIN_PARALLEL_CONSTRAINTS)
-        return runShare(0, 1);
-    const int numThreads = (int) threadResults.size();
-    parallel([&](int thread) { threadResults[thread] = runShare(thread, numThreads); });
+    }
+    typedef std::chrono::steady_clock Clock;
+    const Clock::time_point start = Clock::now();
     ShareResult result;
-    for (const ShareResult& each : threadResults)
-        result.merge(each);
+    if (threadChoice.isParallel()) {
+        const int numThreads = (int) threadResults.size();
+        parallel([&](int thread) {
+            ShareResult own; // on the thread's own stack, away from those of others
+            share(thread, numThreads, own);
+            threadResults[thread] = own;
+        });
+        for (const ShareResult& each : threadResults)
+            result.merge(each);
+    }
+    else
+        share(0, 1, result);
+    sharedSeconds += std::chrono::duration<double>(Clock::now() - start).count();
     return result;
+}
+
+// Run a task on the joints of each cut cluster, when that on the pieces has ended.
+template <class JointTask> void VRattleDynamics::forJoints(const JointTask& task) {
+    for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters())
+        task(cluster);
 }
 
 // Where the iteration starts. Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes
 // that O(h^3).
+void VRattleDynamics::startMultipliers(bool withOffset, int first, int end) {
+    for (int k = first; k < end; k++)
+        lambdaNext[k] = withOffset ? lambda[k] + multiplierOffset[k] : lambda[k];
+}
+
 void VRattleDynamics::startMultipliers(bool withOffset) {
-    lambdaNext = lambda;
-    if (withOffset)
-        for (size_t k = 0; k < lambdaNext.size(); k++)
-            lambdaNext[k] += multiplierOffset[k];
+    startMultipliers(withOffset, 0, system.getNumConstraints());
 }
 
 void VRattleDynamics::keepOffsets() {
@@ -554,96 +669,159 @@ void VRattleDynamics::keepOffsets() {
         multiplierOffset[k] = lambdaNext[k] - lambda[k];
 }
 
-StepArrays VRattleDynamics::stepArrays(const vector<Vec3>& start, double kick, double drift) {
-    return {
-        q.data(),          start.data(),           force.data(),          qNext.data(), wNext.data(), lambdaNext.data(),
-        correction.data(), multiplierTrial.data(), rightSideTrial.data(), kick,         drift};
+StepArrays VRattleDynamics::stepArrays(const Trial& trial) {
+    return {q.data(),          trial.start.data(), force.data(),           qNext.data(),          wNext.data(),
+            lambdaNext.data(), correction.data(),  multiplierTrial.data(), rightSideTrial.data(), trial.kick,
+            trial.drift};
 }
 
-// acceleration = M^-1 (F - G^T lambda), w+ = start + kick acceleration (3.10), q+ = q + drift w+ (3.9)
-void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift, const int* firstParticle,
-                                   const int* endParticle, const ConstraintSystem::Part& part) {
+// w+ = start + kick M^-1 (F - G^T lambda) (3.10), q+ = q + drift w+ (3.9); w+ is kept if it is asked for.
+void VRattleDynamics::computeTrial(const Trial& trial, const int* firstParticle, const int* endParticle,
+                                   const ConstraintSystem::Part& part, bool withVelocities) {
     const vector<double>& inverseMasses = system.getInverseMasses();
+    vector<Vec3>& acceleration = withVelocities ? wNext : qNext; // until these are known
     for (const int* i = firstParticle; i < endParticle; i++)
         acceleration[*i] = force[*i] * inverseMasses[*i];
     system.addTransposedOverMass(jacobian, lambdaNext, -1.0, acceleration, part);
     for (const int* i = firstParticle; i < endParticle; i++) {
-        wNext[*i] = start[*i] + acceleration[*i] * kick;
-        qNext[*i] = q[*i] + wNext[*i] * drift;
+        const Vec3 velocity = trial.start[*i] + acceleration[*i] * trial.kick;
+        if (withVelocities)
+            wNext[*i] = velocity;
+        qNext[*i] = q[*i] + velocity * trial.drift;
     }
 }
 
-void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift) {
-    computeTrial(start, kick, drift, movingParticles.data(), movingParticles.data() + movingParticles.size(),
-                 ConstraintSystem::ALL);
+void VRattleDynamics::computeTrial(const Trial& trial) {
+    computeTrial(trial, movingParticles.data(), movingParticles.data() + movingParticles.size(), ConstraintSystem::ALL,
+                 true);
 }
 
-void VRattleDynamics::computeTrial(const vector<Vec3>& start, double kick, double drift,
-                                   const ConstraintSystem::Part& part) {
+void VRattleDynamics::computeTrial(const Trial& trial, const ConstraintSystem::Part& part, bool withVelocities) {
     const int* particles = system.getGeneralParticles().data();
-    computeTrial(start, kick, drift, particles + part.firstParticle, particles + part.endParticle, part);
+    computeTrial(trial, particles + part.firstParticle, particles + part.endParticle, part, withVelocities);
 }
 
-void VRattleDynamics::moveFreeParticle(int i, const vector<Vec3>& start, double kick, double drift) {
-    wNext[i] = start[i] + force[i] * (kick * system.getInverseMasses()[i]);
-    qNext[i] = q[i] + wNext[i] * drift;
+void VRattleDynamics::moveFreeParticle(int i, const Trial& trial) {
+    wNext[i] = trial.start[i] + force[i] * (trial.kick * system.getInverseMasses()[i]);
+    qNext[i] = q[i] + wNext[i] * trial.drift;
 }
 
 // Solve g(q+) = 0 (3.11) for lambda, with given kick and drift, by chord iterations with A = -kick drift K(q).
-bool VRattleDynamics::solvePositions(const vector<Vec3>& start, double kick, double drift, double margin) {
-    startMultipliers(margin == REGULAR_MARGIN);
-    if (!system.getGeneralParts().empty())
+bool VRattleDynamics::solvePositions(const Trial& trial, double margin) {
+    const bool withOffset = margin == REGULAR_MARGIN;
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        startMultipliers(withOffset, cluster.joints.first, cluster.joints.end);
+    });
+    if (system.getFirstGeneral() < system.getNumConstraints())
         ensureFactor(GeneralFactor);
-    const StepArrays arrays = stepArrays(start, kick, drift);
+    const StepArrays arrays = stepArrays(trial);
     const double tolerance = margin * settings.tolerance;
-    const ShareResult result = runShared(
-        [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
-            share.error = larger(share.error, batch.solvePositions(arrays, begin, end, tolerance, share.iterations));
-        },
-        [&](int i) { moveFreeParticle(i, start, kick, drift); },
-        [&](const ConstraintSystem::Part& part, ShareResult& share) {
-            share.error = larger(share.error, solveGeneral(part, start, kick, drift, tolerance, share.iterations));
-        });
+    ShareResult result =
+        runShared([](int) {},
+                  [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
+                      startMultipliers(withOffset, batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
+                      share.error =
+                          larger(share.error, batch.solvePositions(arrays, begin, end, tolerance, share.iterations));
+                  },
+                  [&](int i) { moveFreeParticle(i, trial); },
+                  [&](const ConstraintSystem::Part& part, ShareResult& share) {
+                      startMultipliers(withOffset, part.first, part.end);
+                      share.error = larger(share.error, solveGeneral(part, trial, tolerance, share.iterations));
+                  },
+                  [&](const ConstraintSystem::Part& piece, ShareResult& share) {
+                      startMultipliers(withOffset, piece.first, piece.end);
+                      share.pieceError = larger(share.pieceError, evaluatePiece(piece, trial, tolerance, true));
+                  });
+    if (!system.getPieces().empty())
+        result.error = larger(result.error, solvePieces(trial, result.pieceError, tolerance, result.iterations));
     lastError = result.error;
     numIterations += result.iterations;
-    return lastError <= settings.tolerance || solvePositionsByNewton(start, kick, drift);
+    return lastError <= settings.tolerance || solvePositionsByNewton(trial);
 }
 
-// The same for one part of the clusters that are in no batch; returns the largest |g| left.
-double VRattleDynamics::solveGeneral(const ConstraintSystem::Part& part, const vector<Vec3>& start, double kick,
-                                     double drift, double tolerance, int& iterations) {
+// Whether an iteration is to end: when there has been at least one update, since Lambda itself, unrefined, costs accuracy even where
+// it meets the tolerance, and the error is small enough, or no longer reduced, so that it is rounding, or Newton's to deal with.
+bool VRattleDynamics::isLastIteration(int iteration, double error, double previous, double tolerance) {
+    return iteration > 0 && (error <= tolerance || !(error < 0.5 * previous) || iteration == MAX_CHORD_ITERATIONS);
+}
+
+// The same for clusters that are in no batch and not cut; returns the largest |g| left.
+double VRattleDynamics::solveGeneral(const ConstraintSystem::Part& part, const Trial& trial, double tolerance,
+                                     int& iterations) {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0;; iteration++) {
-        computeTrial(start, kick, drift, part);
-        const double error = system.evaluate(qNext, residual, jacobian, part);
-        // At least one update: Lambda itself, unrefined, costs accuracy even where it meets the tolerance. Where the error
-        // is no longer reduced it is rounding, or Newton's to deal with.
-        if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous) || iteration == MAX_CHORD_ITERATIONS)) {
+        computeTrial(trial, part, iteration > 0); // there is at least one update
+        const double error = system.evaluate(qNext, correction, jacobian, part);
+        if (isLastIteration(iteration, error, previous, tolerance)) {
             iterations = std::max(iterations, iteration);
             return error;
         }
         previous = error;
-        std::copy(residual.begin() + part.first, residual.begin() + part.end, correction.begin() + part.first);
         matrix.solve(correction, part);
-        for (int k = part.first; k < part.end; k++)
-            lambdaNext[k] += correction[k] / (kick * drift);
+        updateMultipliers(trial, part.first, part.end);
+    }
+}
+
+void VRattleDynamics::updateMultipliers(const Trial& trial, int first, int end) {
+    for (int k = first; k < end; k++)
+        lambdaNext[k] += correction[k] / (trial.kick * trial.drift);
+}
+
+// Evaluate a piece for the present multipliers, and begin to solve for their next correction if there will be one for certain;
+// returns the largest |g|.
+double VRattleDynamics::evaluatePiece(const ConstraintSystem::Part& piece, const Trial& trial, double tolerance,
+                                      bool isFirst) {
+    computeTrial(trial, piece, !isFirst);
+    const double error = system.evaluate(qNext, correction, jacobian, piece);
+    isPieceEliminated[piece.piece] = isFirst || error > tolerance;
+    if (isPieceEliminated[piece.piece])
+        matrix.eliminate(correction, piece);
+    return error;
+}
+
+// The iteration for cut clusters, after evaluatePiece() for all pieces, which found the error.
+double VRattleDynamics::solvePieces(const Trial& trial, double error, double tolerance, int& iterations) {
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0;; iteration++) {
+        forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+            error = larger(error, system.evaluate(qNext, correction, jacobian, cluster.joints));
+        });
+        if (isLastIteration(iteration, error, previous, tolerance)) {
+            iterations = std::max(iterations, iteration);
+            return error;
+        }
+        previous = error;
+        if (std::count(isPieceEliminated.begin(), isPieceEliminated.end(), false) > 0)
+            runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult&) {
+                if (!isPieceEliminated[piece.piece])
+                    matrix.eliminate(correction, piece);
+            });
+        forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+            matrix.solveJoints(correction, cluster);
+            updateMultipliers(trial, cluster.joints.first, cluster.joints.end);
+        });
+        error = runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult& share) {
+                    matrix.substitute(correction, piece);
+                    updateMultipliers(trial, piece.first, piece.end);
+                    share.error = larger(share.error, evaluatePiece(piece, trial, tolerance, false));
+                }).error;
     }
 }
 
 // The same for all constraints with Newton's iteration: G(q+) M^-1 G(q)^T in place of K. Where the chord iteration fails.
-bool VRattleDynamics::solvePositionsByNewton(const vector<Vec3>& start, double kick, double drift) {
+bool VRattleDynamics::solvePositionsByNewton(const Trial& trial) {
     ensureFactor(FullFactor);
     // From where the chord iteration has come to, and if that was too far off, from Lambda.
-    if (iterateNewton(start, kick, drift))
+    if (iterateNewton(trial))
         return true;
     startMultipliers(false);
-    return iterateNewton(start, kick, drift);
+    return iterateNewton(trial);
 }
 
-bool VRattleDynamics::iterateNewton(const vector<Vec3>& start, double kick, double drift) {
+bool VRattleDynamics::iterateNewton(const Trial& trial) {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
-        computeTrial(start, kick, drift);
+        computeTrial(trial);
         lastError = system.evaluate(qNext, residual, jacobian);
         if (!std::isfinite(lastError))
             return false;
@@ -656,8 +834,7 @@ bool VRattleDynamics::iterateNewton(const vector<Vec3>& start, double kick, doub
         if (!newtonMatrix.factorize(jacobianNext, jacobian))
             return false;
         newtonMatrix.solve(correction);
-        for (size_t k = 0; k < lambdaNext.size(); k++)
-            lambdaNext[k] += correction[k] / (kick * drift);
+        updateMultipliers(trial, 0, system.getNumConstraints());
         numIterations++;
     }
     return false;
@@ -674,7 +851,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
         halfStepValue = evaluateU(w);
         hasHalfStepValue = true;
     }
-    if (!system.getGeneralParts().empty())
+    if (system.getFirstGeneral() < system.getNumConstraints())
         ensureFactor(GeneralFactor);
     rhoNext = StepDensity::sumUpdate(u, rho) + densityOffset;
     if (!(rhoNext > 0))
@@ -684,17 +861,21 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     double previous = std::numeric_limits<double>::infinity();
     const double densityTolerance = std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING);
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
-        const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
-        const StepArrays arrays = stepArrays(w, kick, drift);
-        lastError = runShared(
-                        [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
-                            share.error = larger(share.error, batch.coupledPass(arrays, begin, end));
-                        },
-                        [&](int i) { moveFreeParticle(i, w, kick, drift); },
-                        [&](const ConstraintSystem::Part& part, ShareResult& share) {
-                            share.error = larger(share.error, coupledPassGeneral(part, kick, drift));
-                        })
-                        .error;
+        const Trial trial = {w, 0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext};
+        const StepArrays arrays = stepArrays(trial);
+        const ShareResult result = runShared([](int) {},
+                                             [&](const ClusterBatch& batch, int begin, int end, ShareResult& share) {
+                                                 share.error =
+                                                     larger(share.error, batch.coupledPass(arrays, begin, end));
+                                             },
+                                             [&](int i) { moveFreeParticle(i, trial); },
+                                             [&](const ConstraintSystem::Part& part, ShareResult& share) {
+                                                 share.error = larger(share.error, coupledPassGeneral(part, trial));
+                                             },
+                                             [&](const ConstraintSystem::Part& piece, ShareResult& share) {
+                                                 share.error = larger(share.error, beginCoupledPass(piece, trial));
+                                             });
+        lastError = larger(result.error, finishCoupledPassOfPieces(trial));
         monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
         const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
@@ -712,19 +893,47 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     return TooSlow;
 }
 
-// One pass of the coupled iteration for a part of the clusters that are in no batch; see ClusterBatch::coupledPass().
-double VRattleDynamics::coupledPassGeneral(const ConstraintSystem::Part& part, double kick, double drift) {
+// One pass of the coupled iteration for clusters that are in no batch and not cut; see ClusterBatch::coupledPass().
+double VRattleDynamics::coupledPassGeneral(const ConstraintSystem::Part& part, const Trial& trial) {
+    const double error = beginCoupledPass(part, trial);
+    matrix.substitute(multiplierTrial, part);
+    matrix.substitute(correction, part);
+    return error;
+}
+
+// Its first half: evaluate a part for corrected multipliers, and begin to solve for Lambda there and for their next correction.
+double VRattleDynamics::beginCoupledPass(const ConstraintSystem::Part& part, const Trial& trial) {
     for (int k = part.first; k < part.end; k++)
         lambdaNext[k] += correction[k];
-    computeTrial(w, kick, drift, part);
-    const double error = system.evaluate(qNext, residual, jacobian, part);
+    computeTrial(trial, part, true);
+    const double error = formCoupledEquations(part, trial);
+    matrix.eliminate(multiplierTrial, part, 0);
+    matrix.eliminate(correction, part, 1);
+    return error;
+}
+
+double VRattleDynamics::formCoupledEquations(const ConstraintSystem::Part& part, const Trial& trial) {
+    const double error = system.evaluate(qNext, correction, jacobian, part);
     system.evaluateCurvature(q, wNext, rightSideTrial, part);
     for (int k = part.first; k < part.end; k++) {
         multiplierTrial[k] = rightSideTrial[k] += appliedTerm[k];
-        correction[k] = residual[k] / (kick * drift);
+        correction[k] /= trial.kick * trial.drift;
     }
-    matrix.solve(multiplierTrial, part);
-    matrix.solve(correction, part);
+    return error;
+}
+
+// The rest for cut clusters, after beginCoupledPass() for all pieces; returns the largest |g| of the joints.
+double VRattleDynamics::finishCoupledPassOfPieces(const Trial& trial) {
+    double error = 0;
+    forJoints([&](const ConstraintSystem::CutCluster& cluster) {
+        error = larger(error, formCoupledEquations(cluster.joints, trial));
+        matrix.solveJoints(multiplierTrial, cluster, 0);
+        matrix.solveJoints(correction, cluster, 1);
+    });
+    runOnPieces([&](const ConstraintSystem::Part& piece, ShareResult&) {
+        matrix.substitute(multiplierTrial, piece);
+        matrix.substitute(correction, piece);
+    });
     return error;
 }
 
@@ -742,7 +951,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
-        computeTrial(w, kick, drift);
+        computeTrial({w, kick, drift});
         lastError = system.evaluate(qNext, residual, jacobian);
         const double uPlus = evaluateU(wNext);
         const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8
@@ -769,8 +978,9 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         double d = 1;
         const double kickChange = -0.5 * h / (rhoNext * rhoNext); // d(kick)/d(rho+)
         for (int i : movingParticles) {
-            d -= derivative * kickChange * gradient[i].dot(acceleration[i]);
-            halfStepChange[i] = acceleration[i] * (drift * kickChange) - wNext[i] * (drift / rhoNext);
+            const Vec3 kickPart = (wNext[i] - w[i]) * (kickChange / kick); // of dw+/drho+
+            d -= derivative * gradient[i].dot(kickPart);
+            halfStepChange[i] = kickPart * drift - wNext[i] * (drift / rhoNext);
         }
         system.multiply(jacobianNext, halfStepChange, response);
         newtonMatrix.solve(response);
@@ -801,7 +1011,7 @@ double VRattleDynamics::solveRegular() {
     const double h = settings.stepSize;
     auto solveWith = [&](double next) {
         rhoNext = next;
-        return solvePositions(w, 0.5 * (h / rho + h / rhoNext), h / rhoNext, REGULAR_MARGIN);
+        return solvePositions({w, 0.5 * (h / rho + h / rhoNext), h / rhoNext}, REGULAR_MARGIN);
     };
     const bool isFixed = settings.isFixedStep || monitor.isEmpty();
     bool isSolved;
@@ -848,6 +1058,7 @@ void VRattleDynamics::throwNotConverged() const {
 // ------------------------------------------------------------------------------------------------------- the steps
 
 double VRattleDynamics::step(double maxStep) {
+    sharedSeconds = 0;
     double full;
     if (hasDensity) {
         stepKind = Regular;
@@ -875,7 +1086,7 @@ double VRattleDynamics::step(double maxStep) {
         // A step of plain RATTLE from the on-step state.
         if (isShortened)
             stepKind = Shortened;
-        if (!solvePositions(v, 0.5 * stepNext, stepNext, ON_STEP_MARGIN))
+        if (!solvePositions({v, 0.5 * stepNext, stepNext}, ON_STEP_MARGIN))
             throwNotConverged();
     }
     if (isShortened && hasDensity) // where the density would be at the end of the shortened step
@@ -897,6 +1108,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     if (settings.isAutomatic)
         automatic.measure(vNext, forces, lambdaOnStep, rightSideNext, wNext, stepNext, force);
     // From here on nothing fails.
+    threadChoice.add(sharedSeconds);
     if (settings.isAutomatic)
         acceptAutomatic();
     if (stepKind == Regular)
@@ -978,7 +1190,7 @@ void VRattleDynamics::reverse() {
 bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energy, vector<double>& backValues) {
     qNext.swap(qBack);
     wNext.swap(wBack);
-    bool isSolved = solvePositions(v, -0.5 * stepNext, -stepNext, ON_STEP_MARGIN);
+    bool isSolved = solvePositions({v, -0.5 * stepNext, -stepNext}, ON_STEP_MARGIN);
     qNext.swap(qBack);
     wNext.swap(wBack);
     if (!isSolved)

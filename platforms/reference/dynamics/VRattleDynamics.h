@@ -12,6 +12,7 @@
 #include "StepDensity.h"
 #include "StepFailure.h"
 #include "StepMonitor.h"
+#include "ThreadChoice.h"
 #include "openmm/Vec3.h"
 #include <functional>
 #include <limits>
@@ -71,8 +72,8 @@ public:
     /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
     typedef std::function<void(const std::function<void(int)>&)> Parallel;
     /**
-     * Let threads share the clusters where these are many enough to pay for it. Results do not depend on
-     * the number of threads, to the last bit.
+     * Let threads share the clusters, and the pieces of large ones, where that is faster. Results do not depend on the number of
+     * threads, to the last bit.
      */
     void setParallel(const Parallel& parallel, int numThreads);
 
@@ -221,36 +222,62 @@ private:
                         const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
                         std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
                         std::vector<double>& rightSides, std::vector<double>& monitorValues, bool withHalfStep);
-    int evaluateOnStepGeneral(const ConstraintSystem::Part& part, const OnStepArrays& arrays,
-                              const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
-                              const std::vector<OpenMM::Vec3>& forces, std::vector<OpenMM::Vec3>& velocities,
-                              std::vector<double>& multipliers, std::vector<double>& rightSides);
+    /** The on-step state that is computed, and what from. */
+    struct OnStep {
+        const std::vector<OpenMM::Vec3>&positions, &halfStep, &forces;
+        std::vector<OpenMM::Vec3>& velocities;
+        std::vector<double>&multipliers, &rightSides;
+        double kick;
+        bool withHalfStep;
+    };
+    int evaluateOnStepGeneral(const OnStep& state, const ConstraintSystem::Part& part);
+    int evaluateOnStepPieces(const OnStep& state);
+    int beginVelocities(const OnStep& state, const ConstraintSystem::Part& part);
+    void beginMultipliers(const OnStep& state, const ConstraintSystem::Part& part);
+    void formMultiplierEquations(const OnStep& state, const ConstraintSystem::Part& part);
+    void beginRates(const OnStep& state, const ConstraintSystem::Part& part);
+    void formRateEquations(const OnStep& state, const ConstraintSystem::Part& part);
     double evaluateRate();
 
     /** What tasks on clusters find: the largest error, the smallest pivot (a NaN counts), and the like. */
     struct ShareResult {
-        double error = 0, pivot = std::numeric_limits<double>::infinity();
+        double error = 0, pieceError = 0, pivot = std::numeric_limits<double>::infinity();
         int iterations = 0, failed = ConstraintMatrix::REGULAR;
         void merge(const ShareResult& other);
     };
-    template <class Task, class FreeTask, class PartTask>
-    ShareResult runShared(const Task& task, const FreeTask& freeTask, const PartTask& partTask);
+    template <class BlockTask, class Task, class FreeTask, class PartTask, class PieceTask>
+    ShareResult runShared(const BlockTask& blockTask, const Task& task, const FreeTask& freeTask,
+                          const PartTask& partTask, const PieceTask& pieceTask);
+    template <class PieceTask> ShareResult runOnPieces(const PieceTask& task);
+    template <class Share> ShareResult runOnThreads(const Share& share);
+    template <class JointTask> void forJoints(const JointTask& task);
 
-    StepArrays stepArrays(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    /** A step from q: half-step velocities start + kick acceleration, positions q + drift of these. */
+    struct Trial {
+        const std::vector<OpenMM::Vec3>& start;
+        double kick, drift;
+    };
+    StepArrays stepArrays(const Trial& trial);
+    void startMultipliers(bool withOffset, int first, int end);
     void startMultipliers(bool withOffset);
-    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift, const int* firstParticle,
-                      const int* endParticle, const ConstraintSystem::Part& part);
-    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
-    void computeTrial(const std::vector<OpenMM::Vec3>& start, double kick, double drift,
-                      const ConstraintSystem::Part& part);
-    void moveFreeParticle(int i, const std::vector<OpenMM::Vec3>& start, double kick, double drift);
-    bool solvePositions(const std::vector<OpenMM::Vec3>& start, double kick, double drift, double margin);
-    double solveGeneral(const ConstraintSystem::Part& part, const std::vector<OpenMM::Vec3>& start, double kick,
-                        double drift, double tolerance, int& iterations);
-    bool solvePositionsByNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
-    bool iterateNewton(const std::vector<OpenMM::Vec3>& start, double kick, double drift);
+    void computeTrial(const Trial& trial, const int* firstParticle, const int* endParticle,
+                      const ConstraintSystem::Part& part, bool withVelocities);
+    void computeTrial(const Trial& trial);
+    void computeTrial(const Trial& trial, const ConstraintSystem::Part& part, bool withVelocities);
+    void moveFreeParticle(int i, const Trial& trial);
+    bool solvePositions(const Trial& trial, double margin);
+    static bool isLastIteration(int iteration, double error, double previous, double tolerance);
+    double solveGeneral(const ConstraintSystem::Part& part, const Trial& trial, double tolerance, int& iterations);
+    void updateMultipliers(const Trial& trial, int first, int end);
+    double evaluatePiece(const ConstraintSystem::Part& piece, const Trial& trial, double tolerance, bool isFirst);
+    double solvePieces(const Trial& trial, double error, double tolerance, int& iterations);
+    bool solvePositionsByNewton(const Trial& trial);
+    bool iterateNewton(const Trial& trial);
     SolveResult solveCoupled();
-    double coupledPassGeneral(const ConstraintSystem::Part& part, double kick, double drift);
+    double beginCoupledPass(const ConstraintSystem::Part& part, const Trial& trial);
+    double formCoupledEquations(const ConstraintSystem::Part& part, const Trial& trial);
+    double coupledPassGeneral(const ConstraintSystem::Part& part, const Trial& trial);
+    double finishCoupledPassOfPieces(const Trial& trial);
     SolveResult solveCoupledByNewton();
     double solveRegular();
     void keepOffsets();
@@ -272,6 +299,8 @@ private:
     std::vector<int> movingParticles;
     Parallel parallel; // empty: one thread
     std::vector<ShareResult> threadResults;
+    ThreadChoice threadChoice;
+    double sharedSeconds; // spent in this step on what threads may share
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
@@ -297,6 +326,7 @@ private:
     std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
     std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
     ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
+    std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the correction of a piece
 
     // Work space of the start.
     std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;

@@ -131,12 +131,12 @@ struct Sample {
     }
     double value(const vector<Vec3>& x) {
         vector<double> g(1);
-        group->evaluate(x, g);
+        group->evaluate(x, g, 0, 1);
         return g[0];
     }
     double curvature(const vector<Vec3>& v) {
         vector<double> result(1);
-        group->evaluateCurvature(positions, v, result);
+        group->evaluateCurvature(positions, v, result, 0, 1);
         return result[0];
     }
     vector<double> inOrder(const vector<Vec3>& rows) {
@@ -147,12 +147,12 @@ struct Sample {
     }
     vector<double> gradient(const vector<Vec3>& x) {
         vector<Vec3> rows(NUM_PARTICLES);
-        group->evaluateJacobian(x, rows);
+        group->evaluateJacobian(x, rows, 0, 1);
         return inOrder(rows);
     }
     vector<double> velocityRow(const vector<Vec3>& v) {
         vector<Vec3> rows(NUM_PARTICLES);
-        group->evaluateVelocityJacobian(positions, v, rows);
+        group->evaluateVelocityJacobian(positions, v, rows, 0, 1);
         return inOrder(rows);
     }
     ExpressionConstraint constraint;
@@ -318,21 +318,24 @@ void testGroups() {
         together.setParameters(count / 2, constraints[count / 2].parameters);
         vector<double> g(count), curvature(count);
         vector<Vec3> rows(2 * count), velocityRows(2 * count);
-        together.evaluate(q, g);
-        together.evaluateCurvature(q, v, curvature);
-        together.evaluateJacobian(q, rows);
-        together.evaluateVelocityJacobian(q, v, velocityRows);
+        const int cut = count / 3; // in two ranges
+        for (const auto& range : {std::make_pair(0, cut), std::make_pair(cut, count)}) {
+            together.evaluate(q, g, range.first, range.second);
+            together.evaluateCurvature(q, v, curvature, range.first, range.second);
+            together.evaluateJacobian(q, rows, range.first, range.second);
+            together.evaluateVelocityJacobian(q, v, velocityRows, range.first, range.second);
+        }
         for (int i = 0; i < count; i++) {
             ExpressionGroup alone(constraints[i]);
             alone.add(constraints[i], 0, 0, inverseMasses);
             vector<double> number(1);
             vector<Vec3> row(2), velocityRow(2);
-            alone.evaluate(q, number);
+            alone.evaluate(q, number, 0, 1);
             ASSERT_EQUAL(number[0], g[count - 1 - i]);
-            alone.evaluateCurvature(q, v, number);
+            alone.evaluateCurvature(q, v, number, 0, 1);
             ASSERT_EQUAL(number[0], curvature[count - 1 - i]);
-            alone.evaluateJacobian(q, row);
-            alone.evaluateVelocityJacobian(q, v, velocityRow);
+            alone.evaluateJacobian(q, row, 0, 1);
+            alone.evaluateVelocityJacobian(q, v, velocityRow, 0, 1);
             for (int p = 0; p < 2; p++) {
                 ASSERT(row[p] == rows[2 * i + p]);
                 ASSERT(velocityRow[p] == velocityRows[2 * i + p]);
@@ -343,7 +346,7 @@ void testGroups() {
             if (i % 3 == 0) {
                 v[2 * i] = Vec3(5, 5, 5);
                 const double before = number[0];
-                alone.evaluateCurvature(q, v, number);
+                alone.evaluateCurvature(q, v, number, 0, 1);
                 ASSERT_EQUAL(before, number[0]);
             }
         }
