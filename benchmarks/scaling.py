@@ -3,12 +3,13 @@
 """How the cost of a step, the memory and the preparation grow with the number of constraints.
 
 Steps of our solver alone, without forces, for rigid waters, proteins with bonds to hydrogen and with all bonds fixed
-(many copies of one of 159 residues), and one polymer chain. Beside them, what OpenMM needs to prepare its own
-solver (CCMA) for a chain, which it does for every Context of the platforms Reference and CPU, with whatever integrator.
+(many copies of one of 159 residues), and one polymer chain. Beside them, for chains as long as --context says, what
+OpenMM's own solver (CCMA) takes: to prepare it, which OpenMM does for every Context of the platforms Reference and CPU,
+with whatever integrator (half an hour for a million bonds), and to constrain the positions and velocities of a step.
 
 A table and one JSON line a measurement are printed. `make scaling` builds the program solver.cpp and runs this.
 
-    python benchmarks/scaling.py --program FILE [--constraints 10000 100000 1000000] [--context 200000]
+    python benchmarks/scaling.py --program FILE [--constraints 10000 100000 1000000] [--context 200000 ...]
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ import openmm
 import rich.console
 import rich.table
 from openmm import app, unit
+
+GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+TOLERANCE = 1e-8  # as in solver.cpp
 
 
 def arrays_of(problem: problems.Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -66,8 +70,7 @@ SYSTEMS = {
 def measure(program: str, name: str, count: int, update: str, threads: int) -> dict:
     """Steps of one system, in a process of its own."""
     masses, pairs, lengths, positions = SYSTEMS[name](count)
-    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
-    speeds = np.sqrt(gas * problems.TEMPERATURE / masses)
+    speeds = np.sqrt(GAS_CONSTANT * problems.TEMPERATURE / masses)
     velocities = np.random.default_rng(2).normal(size=positions.shape) * speeds[:, None]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "problem"
@@ -96,13 +99,42 @@ def measure(program: str, name: str, count: int, update: str, threads: int) -> d
     }
 
 
-def context_seconds(bonds: int) -> float:
-    """The time that OpenMM takes to create a Context of a chain with its own VerletIntegrator."""
+def beside_openmm(program: str, bonds: int) -> dict:
+    """A chain prepared and solved by us, on one thread, and by OpenMM's Context, platform Reference, both at 1e-8."""
+    ours = measure(program, "chain", bonds, "Explicit", 1)
     problem = problems.chain(bonds)
-    integrator = openmm.VerletIntegrator(problems.STEP)
-    begin = time.perf_counter()
-    openmm.Context(problem.system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    return time.perf_counter() - begin
+    begin = time.process_time()
+    platform = openmm.Platform.getPlatformByName("Reference")
+    context = openmm.Context(problem.system, openmm.VerletIntegrator(problems.STEP), platform)
+    prepared = time.process_time() - begin
+    speed = np.sqrt(GAS_CONSTANT * problems.TEMPERATURE / problem.system.getParticleMass(0).value_in_unit(unit.dalton))
+    context.setPositions(problem.positions)
+    context.setVelocities(speed * np.random.default_rng(2).normal(size=problem.positions.shape))
+    context.applyVelocityConstraints(1e-12)
+    velocities = context.getState(velocities=True).getVelocities(asNumpy=True)
+    tangent = velocities.value_in_unit(unit.nanometer / unit.picosecond)
+    times = []
+    for _ in range(5):
+        context.setPositions(problem.positions + problems.STEP * tangent)
+        begin = time.process_time()
+        context.applyConstraints(TOLERANCE)
+        middle = time.process_time() - begin
+        achieved = problems.constraint_error(problem.system, problems.positions_of(context))
+        context.setVelocities(tangent)
+        begin = time.process_time()
+        context.applyVelocityConstraints(TOLERANCE)
+        times.append(middle + time.process_time() - begin)
+    return {
+        "benchmark": "scaling-context",
+        "bonds": bonds,
+        "ours_prepared_seconds": ours["setup_seconds"],
+        "openmm_prepared_seconds": prepared,
+        "ours_step_seconds": ours["step_seconds"],
+        "ours_achieved": ours["error"],
+        "openmm_seconds": min(times),
+        "openmm_achieved": achieved,
+        "ratio": ours["step_seconds"] / min(times),
+    }
 
 
 def main() -> None:
@@ -113,7 +145,7 @@ def main() -> None:
     parser.add_argument("--constraints", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--update", nargs="+", choices=["Explicit", "SemiExplicit"], default=["Explicit"])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--context", type=int, default=0, help="bonds of a chain whose Context OpenMM is to create")
+    parser.add_argument("--context", type=int, nargs="+", default=[], help="bonds of chains to solve with OpenMM too")
     arguments = parser.parse_args()
     table = rich.table.Table(title="A step of the solver alone, at 1e-8")
     columns = ("system", "update", "threads", "constraints", "ns each", "growth", "kB each", "set up (s)", "updates")
@@ -139,19 +171,19 @@ def main() -> None:
                 f"{result['error']:.1e}",
             )
     rich.console.Console(width=130).print(table)
-    if arguments.context:
-        ours = measure(arguments.program, "chain", arguments.context, "Explicit", 1)
-        theirs = context_seconds(arguments.context)
-        result = {
-            "benchmark": "scaling-context",
-            "bonds": arguments.context,
-            "ours_seconds": ours["setup_seconds"],
-            "openmm_context_seconds": theirs,
-        }
+    for bonds in arguments.context:
+        result = beside_openmm(arguments.program, bonds)
         print(json.dumps(result))
+        print(f"A chain of {bonds:,} bonds, ours and OpenMM's:")
+        print(f"  prepared in {result['ours_prepared_seconds']:.2f} and {result['openmm_prepared_seconds']:.0f} s")
         print(
-            f"A chain of {arguments.context} bonds: ours {ours['setup_seconds']:.2f} s, OpenMM's Context {theirs:.1f} s"
+            f"  a whole step {1e3 * result['ours_step_seconds']:.2f} ms, error left {result['ours_achieved']:.1e};",
+            end=" ",
         )
+        print(
+            f"constraints {1e3 * result['openmm_seconds']:.2f} ms, error left {result['openmm_achieved']:.1e}:", end=" "
+        )
+        print(f"ratio {result['ratio']:.2f}")
 
 
 if __name__ == "__main__":
