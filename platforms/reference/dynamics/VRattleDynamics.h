@@ -9,10 +9,10 @@
 #include "ConstraintMatrix.h"
 #include "ConstraintSystem.h"
 #include "NewtonMatrix.h"
+#include "SharedWork.h"
 #include "StepDensity.h"
 #include "StepFailure.h"
 #include "StepMonitor.h"
-#include "ThreadChoice.h"
 #include "openmm/Vec3.h"
 #include <functional>
 #include <limits>
@@ -69,8 +69,7 @@ public:
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
 
-    /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
-    typedef std::function<void(const std::function<void(int)>&)> Parallel;
+    typedef SharedWork::Parallel Parallel;
     /**
      * Let threads share the clusters, and the pieces of large ones, where that is faster. Results do not depend on the number of
      * threads, to the last bit.
@@ -239,19 +238,6 @@ private:
     void formRateEquations(const OnStep& state, const ConstraintSystem::Part& part);
     double evaluateRate();
 
-    /** What tasks on clusters find: the largest error, the smallest pivot (a NaN counts), and the like. */
-    struct ShareResult {
-        double error = 0, pieceError = 0, pivot = std::numeric_limits<double>::infinity();
-        int iterations = 0, failed = ConstraintMatrix::REGULAR;
-        void merge(const ShareResult& other);
-    };
-    template <class BlockTask, class Task, class FreeTask, class PartTask, class PieceTask>
-    ShareResult runShared(const BlockTask& blockTask, const Task& task, const FreeTask& freeTask,
-                          const PartTask& partTask, const PieceTask& pieceTask);
-    template <class PieceTask> ShareResult runOnPieces(const PieceTask& task);
-    template <class Share> ShareResult runOnThreads(const Share& share);
-    template <class JointTask> void forJoints(const JointTask& task);
-
     /** A step from q: half-step velocities start + kick acceleration, positions q + drift of these. */
     struct Trial {
         const std::vector<OpenMM::Vec3>& start;
@@ -265,7 +251,7 @@ private:
     void computeTrial(const Trial& trial);
     void computeTrial(const Trial& trial, const ConstraintSystem::Part& part, bool withVelocities);
     void moveFreeParticle(int i, const Trial& trial);
-    bool solvePositions(const Trial& trial, double margin);
+    bool solvePositions(const Trial& trial, bool isFromOnStep);
     static bool isLastIteration(int iteration, double error, double previous, double tolerance);
     double solveGeneral(const ConstraintSystem::Part& part, const Trial& trial, double tolerance, int& iterations);
     void updateMultipliers(const Trial& trial, int first, int end);
@@ -295,12 +281,9 @@ private:
     StepMonitor monitor;
     StepDensity density;
     AutomaticControl automatic;
+    SharedWork work;
     Settings settings;
     std::vector<int> movingParticles;
-    Parallel parallel; // empty: one thread
-    std::vector<ShareResult> threadResults;
-    ThreadChoice threadChoice;
-    double sharedSeconds; // spent in this step on what threads may share
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
