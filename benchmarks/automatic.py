@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """What automatic step control gains over fixed steps, on systems where something happens and on calm ones.
 
-    python benchmarks/automatic.py [--systems NAME ...] [--jobs N] [--quick] [--output FOLDER]
+    python benchmarks/automatic.py [--systems NAME ...] [--starts N] [--copies N] [--longer F] [--jobs N] [--quick]
 
 The gain is the largest energy error of RATTLE with fixed steps divided by that with automatic step control, over the
 same time and with the same number of steps: the nominal step is adjusted until this number is about the wanted one,
@@ -11,7 +11,9 @@ besides, once for each run: the calibration of 300 steps and two steps backwards
 that the fixed ones could have taken too; in a run of a million steps they count for nothing.
 
 Energy errors of chaotic motions scatter, so every number is the geometric mean over several starts: other seeds of
-thermal systems, other velocities (by a fiftieth of their size, at random) of the mechanical ones.
+thermal systems, other velocities (by a fiftieth of their size, at random) of the mechanical ones. In runs so long that
+two of them part, that takes more runs still: --copies of each start, with velocities that differ by a millionth, and
+--longer runs with as many more steps.
 
 Prints a table and one line of JSON for each system and number of steps, writes automatic.jsonl, gains.png and
 monitors.png, and says whether the gain falls below what the project claims; exit code 1 if it does.
@@ -61,6 +63,7 @@ MOST_TRIES = 6
 LONGEST_STEP = 4.0  # of nominal steps, relative to the mean step that is wanted: nobody would choose a longer one
 LEAST_GAIN = 0.95  # on every system
 DISTURBANCE = 0.02  # of the velocities of a mechanical system, relative to their root mean square
+COPY_DISTURBANCE = 1e-6  # of each velocity, relative, in the copies of a start
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,8 @@ class Result:
     gain: float
     smallest_gain: float
     largest_gain: float
+    gain_error: float
+    """The standard error of the gain, relative."""
     counted_gain: float
     """With the trial steps counted as steps."""
     fixed_error: float
@@ -152,6 +157,16 @@ class Result:
     largest_density: float
     fixed_failures: int
     """Starts from which fixed steps did not reach the end; they are left out of the means."""
+
+
+def copy_of(start: TestSystem, number: int) -> TestSystem:
+    """The start itself as number 0, or with velocities that differ a little."""
+    if number == 0:
+        return start
+    random = np.random.default_rng(number)
+    velocities = start.velocities * (1 + COPY_DISTURBANCE * random.standard_normal(start.velocities.shape))
+    positions, velocities = project_onto_constraints(start.system, start.positions, velocities)
+    return TestSystem(**{**vars(start), "positions": positions, "velocities": velocities})
 
 
 def start_of(problem: Problem, seed: int) -> TestSystem:
@@ -234,9 +249,9 @@ def adjusted_run(start: TestSystem, total_time: float, steps: int) -> Run:
     return nearest
 
 
-def compare(problem: Problem, steps: int, seed: int, part: float) -> tuple[Run, Run]:
-    """Fixed and automatic steps from one start."""
-    start = start_of(problem, seed)
+def compare(problem: Problem, steps: int, seed: int, copy: int, part: float) -> tuple[Run, Run]:
+    """Fixed and automatic steps from one start, for a part or a multiple of the problem's time and steps."""
+    start = copy_of(start_of(problem, seed), copy)
     own = adjusted_run(start, part * problem.total_time, round(part * steps))
     return run(start, part * problem.total_time, part * problem.total_time / own.steps, False, 2 * own.steps), own
 
@@ -260,6 +275,7 @@ def summary(problem: Problem, steps: int, pairs: Sequence[tuple[Run, Run]]) -> R
         gain=mean(gains),
         smallest_gain=min(gains, default=math.nan),
         largest_gain=max(gains, default=math.nan),
+        gain_error=float(np.std(np.log(gains), ddof=1)) / math.sqrt(len(gains)) if len(gains) > 1 else math.nan,
         counted_gain=mean(counted),
         fixed_error=mean([fixed.error for fixed, _ in survivors]),
         automatic_error=mean([own.error for _, own in survivors]),
@@ -271,13 +287,14 @@ def summary(problem: Problem, steps: int, pairs: Sequence[tuple[Run, Run]]) -> R
 def table(results: Sequence[Result]) -> list[str]:
     """One line for each system and number of steps, in Markdown."""
     lines = [
-        "| system | steps | gain | from start to start | error, fixed | error, automatic | largest density | trial "
-        "steps counted |",
-        "|---|---|---|---|---|---|---|---|",
+        "| system | steps | gain | standard error | from start to start | error, fixed | error, automatic | largest "
+        "density | trial steps counted |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in results:
         lines.append(
-            f"| {r.system} | {round(r.steps):,} | {r.gain:.3g} | {r.smallest_gain:.3g} to {r.largest_gain:.3g} | "
+            f"| {r.system} | {round(r.steps):,} | {r.gain:.3g} | {r.gain_error:.0%} | "
+            f"{r.smallest_gain:.3g} to {r.largest_gain:.3g} | "
             f"{r.fixed_error:.2g} | {r.automatic_error:.2g} | {r.largest_density:.3g} | {r.counted_gain:.2g} |"
         )
     return lines
@@ -356,19 +373,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__.split("\n\n")[0], formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--systems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS), metavar="NAME")
-    parser.add_argument("--starts", type=int, default=4, help="starts of each system (default: 4)")
+    parser.add_argument("--starts", type=int, default=8, help="starts of each system (default: 8)")
+    parser.add_argument("--copies", type=int, default=1, help="slightly different runs from each start (default: 1)")
+    parser.add_argument("--longer", type=float, default=1.0, help="a factor of the time and the steps (default: 1)")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--quick", action="store_true", help="one start and a twentieth of the time; proves nothing")
     parser.add_argument("--output", type=Path, default=Path("out/automatic"), metavar="FOLDER")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     seeds = range(1, 2 if options.quick else options.starts + 1)
-    part = 0.05 if options.quick else 1.0
+    part = 0.05 if options.quick else options.longer
     began = time.perf_counter()
     tasks = [(PROBLEMS[name], steps) for name in options.systems for steps in PROBLEMS[name].steps]
     results = []
     with ProcessPoolExecutor(options.jobs) as pool:
-        futures = [[pool.submit(compare, *task, seed, part) for seed in seeds] for task in tasks]
+        futures = [
+            [pool.submit(compare, *task, seed, copy, part) for seed in seeds for copy in range(options.copies)]
+            for task in tasks
+        ]
         for (problem, steps), some in zip(tasks, futures, strict=True):
             results.append(summary(problem, steps, [future.result() for future in some]))
             print(json.dumps(asdict(results[-1])), flush=True)
@@ -376,7 +398,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     draw_gains(results).savefig(options.output / "gains.png")
     draw_monitors().savefig(options.output / "monitors.png")
     print("\n".join(table(results)))
-    print(f"{len(results) * len(seeds)} comparisons in {time.perf_counter() - began:.0f} s")
+    print(f"{len(results) * len(seeds) * options.copies} comparisons in {time.perf_counter() - began:.0f} s")
     wrong = faults(results)
     for fault in wrong:
         print(f"FAULT: {fault}")
