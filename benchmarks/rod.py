@@ -6,8 +6,8 @@ The rod has three distances and three expression constraints a section, and only
 tridiagonal with blocks of 6 x 6, so that a step should cost the same time per section whatever their number. All rods
 have the same sections of 0.1 nm, and their ends the same speed. "Whole" is a step of plain RATTLE with the forces of
 the rod, "no forces" the same constraints without any force: what the constraints and the step itself cost. The two are
-measured in turn, each length in a process of its own; of many short repetitions the fastest counts. "Relative" is the time per section divided by that of 100
-sections, for with 10 the overhead of a call still shows.
+measured in turn, each length in a process of its own; of many short repetitions the fastest counts. "Relative" is the
+time per section divided by that of 100 sections, for with 10 the overhead of a call still shows.
 
     python benchmarks/rod.py [--sections 10 100 1000 10000] [--repeats 25] [--platform Reference|CPU]
 """

@@ -229,6 +229,27 @@ void testMatrix(const Example& e) {
         }
 }
 
+// The matrix of Newton's iteration, which takes a cut cluster as a whole.
+void testNewtonMatrix(const Example& e) {
+    ConstraintSystem system(e.masses, e.distances, e.expressions);
+    vector<Vec3> ahead = e.positions;
+    for (size_t i = 0; i < ahead.size(); i++)
+        ahead[i] += e.velocities[i] * 0.02;
+    ConstraintSystem::Jacobian current(system.getNumEntries()), next = current;
+    system.evaluateJacobian(e.positions, current);
+    system.evaluateJacobian(ahead, next);
+    const SparseMatrix a =
+        sparseJacobian(system, ahead) * sparseInverseMasses(system) * sparseJacobian(system, e.positions).transpose();
+    vector<double> b(system.getNumConstraints());
+    for (double& x : b)
+        x = uniform(-1, 1);
+    vector<double> x = b;
+    NewtonMatrix matrix(system);
+    ASSERT(matrix.factorize(next, current));
+    matrix.solve(x);
+    ASSERT((a * numbers(x) - numbers(b)).norm() <= 1e-9 * numbers(b).norm());
+}
+
 static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
 }
@@ -288,6 +309,24 @@ void testSteps(const Example& e, StepDensity::Update update) {
         ASSERT_EQUAL_VEC(after[i], dynamics.getPositions()[i], 1e-9);
 }
 
+// Positions that are off by some hundredths of a bond come back, by Newton's iteration where the chord is not enough.
+void testProjection(const Example& e) {
+    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    dynamics.setSettings(makeSettings(StepDensity::Explicit));
+    const ConstraintSystem& system = dynamics.getConstraintSystem();
+    vector<Vec3> positions = e.positions;
+    for (size_t i = 0; i < positions.size(); i++)
+        if (e.masses[i] > 0)
+            positions[i] += randomVector(0.0008);
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    vector<double> g(system.getNumConstraints());
+    system.evaluateJacobian(positions, jacobian);
+    ASSERT(system.evaluate(positions, g, jacobian) > 0.01);
+    ASSERT(dynamics.projectPositions(positions));
+    system.evaluateJacobian(positions, jacobian);
+    ASSERT(system.evaluate(positions, g, jacobian) <= 1e-10);
+}
+
 void testThreads(const Example& e) {
     const VRattleDynamics::Settings automatic = {
         0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {3000, 3000}, 0};
@@ -341,6 +380,10 @@ int main() {
         {"the cut", testCut},
         {"K and its factor, a comb", [&] { testMatrix(comb); }},
         {"K and its factor, a rod", [&] { testMatrix(rod); }},
+        {"Newton's matrix, a comb", [&] { testNewtonMatrix(comb); }},
+        {"Newton's matrix, a rod", [&] { testNewtonMatrix(rod); }},
+        {"projection of a comb", [&] { testProjection(comb); }},
+        {"projection of a rod", [&] { testProjection(rod); }},
         {"steps of a comb, SemiExplicit", [&] { testSteps(comb, StepDensity::SemiExplicit); }},
         {"steps of a comb, Explicit", [&] { testSteps(comb, StepDensity::Explicit); }},
         {"steps of a comb, Bounded", [&] { testSteps(comb, StepDensity::Bounded); }},
