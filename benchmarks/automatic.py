@@ -286,6 +286,10 @@ def summary(problem: Problem, steps: int, pairs: Sequence[tuple[Run, Run]]) -> R
 
 def table(results: Sequence[Result]) -> list[str]:
     """One line for each system and number of steps, in Markdown."""
+
+    def number(x: float) -> str:
+        return f"{x:,.0f}" if x >= 99.5 else f"{x:.3g}"
+
     lines = [
         "| system | steps | gain | standard error | from start to start | error, fixed | error, automatic | largest "
         "density | trial steps counted |",
@@ -293,9 +297,9 @@ def table(results: Sequence[Result]) -> list[str]:
     ]
     for r in results:
         lines.append(
-            f"| {r.system} | {round(r.steps):,} | {r.gain:.3g} | {r.gain_error:.0%} | "
-            f"{r.smallest_gain:.3g} to {r.largest_gain:.3g} | "
-            f"{r.fixed_error:.2g} | {r.automatic_error:.2g} | {r.largest_density:.3g} | {r.counted_gain:.2g} |"
+            f"| {r.system} | {round(r.steps):,} | {number(r.gain)} | {r.gain_error:.0%} | "
+            f"{number(r.smallest_gain)} to {number(r.largest_gain)} | {r.fixed_error:.2g} | {r.automatic_error:.2g} | "
+            f"{number(r.largest_density)} | {number(r.counted_gain)} |"
         )
     return lines
 
