@@ -231,6 +231,22 @@ void testThreads() {
     }
 }
 
+// Whichever way is faster is chosen, whatever single steps took, and found again when it changes.
+void testThreadChoice() {
+    ThreadChoice choice;
+    for (double parallelTime : {0.5, 2.0, 0.7}) {
+        int numParallel = 0, numSteps = 0;
+        for (; numSteps < ThreadChoice::PERIOD; numSteps++) {
+            const bool isParallel = choice.isParallel();
+            numParallel += isParallel;
+            choice.add((isParallel ? parallelTime : 1.0) *
+                       (numSteps % 9 == 0 ? 20 : 1)); // now and then something else runs
+        }
+        const int inTrial = ThreadChoice::TRIAL_LENGTH / 2;
+        ASSERT_EQUAL(parallelTime < 1 ? numSteps - inTrial : inTrial, numParallel);
+    }
+}
+
 int main() {
     return runTests({
         {"clusters of every shape, SemiExplicit", [] { testShapes(StepDensity::SemiExplicit); }},
@@ -238,5 +254,6 @@ int main() {
         {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
         {"another frame of reference", testChangedFrame},
         {"any number of threads", testThreads},
+        {"the choice of threads", testThreadChoice},
     });
 }
