@@ -131,7 +131,7 @@ def time_step(
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
     context.setPositions(positions.reshape(-1, 3))
     context.setVelocities(random.normal(size=(number * size, 3)) * 0.25)  # 300 K
-    integrator.step(3)
+    integrator.step(60)  # until the number of threads has been chosen
     before, steps = integrator.getNumSolverIterations(), 10
     elapsed = measure(lambda: integrator.step(steps), repeats) / steps
     return elapsed, (integrator.getNumSolverIterations() - before) / (steps * repeats)

@@ -76,7 +76,11 @@ int main(int argc, char** argv) {
     OpenMM::ThreadPool threads(std::stoi(argv[6]));
     dynamics.setParallel(
         [&](const std::function<void(int)>& task) {
-            threads.execute([&task](OpenMM::ThreadPool&, int thread) { task(thread); });
+            threads.execute([&task](OpenMM::ThreadPool&, int thread) {
+                if (thread > 0)
+                    task(thread);
+            });
+            task(0);
             threads.waitForThreads();
         },
         threads.getNumThreads());

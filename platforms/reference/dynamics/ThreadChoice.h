@@ -16,9 +16,9 @@ namespace OpenMMVRattle {
 class ThreadChoice {
 public:
     /** Now and then there is a trial: so many runs of so many steps, every other of them with several threads. */
-    static constexpr int NUM_RUNS = 6, RUN_LENGTH = 4, TRIAL_LENGTH = NUM_RUNS * RUN_LENGTH;
+    static constexpr int NUM_RUNS = 4, RUN_LENGTH = 12, TRIAL_LENGTH = NUM_RUNS * RUN_LENGTH;
     /** The steps from the beginning of one trial to that of the next. */
-    static constexpr int PERIOD = 2000;
+    static constexpr int PERIOD = 1000;
     /** Whether the next step is to use several threads. */
     bool isParallel() const {
         return place < TRIAL_LENGTH ? place / RUN_LENGTH % 2 == 0 : isParallelFaster;
@@ -27,7 +27,8 @@ public:
     void add(double seconds) {
         if (place == 0)
             counts[false] = counts[true] = 0;
-        if (place < TRIAL_LENGTH && place % RUN_LENGTH > 0) // the first step of a run bears the cost of the change
+        // The first steps of a run bear the cost of the change: threads that have slept wake up slowly.
+        if (place < TRIAL_LENGTH && place % RUN_LENGTH >= RUN_LENGTH / 2)
             trial[isParallel()][counts[isParallel()]++] = seconds;
         place = (place + 1) % PERIOD;
         if (place == TRIAL_LENGTH)
@@ -35,7 +36,7 @@ public:
     }
 
 private:
-    static constexpr int NUM_MEASURED = NUM_RUNS / 2 * (RUN_LENGTH - 1); // each way
+    static constexpr int NUM_MEASURED = NUM_RUNS / 2 * (RUN_LENGTH / 2); // each way
     double findMedian(bool parallel) {
         std::nth_element(trial[parallel], trial[parallel] + NUM_MEASURED / 2, trial[parallel] + NUM_MEASURED);
         return trial[parallel][NUM_MEASURED / 2];

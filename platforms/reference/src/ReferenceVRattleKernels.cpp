@@ -141,8 +141,13 @@ void ReferenceIntegrateVRattleStepKernel::initialize(const System& system,
     dynamics.reset(new VRattleDynamics(masses, constraints, expressions));
     trial.reset();
     if (getPlatform().getName() != "Reference") { // which does everything on one thread
+        // This thread is awake and takes the share of the pool's first.
         auto runOnThreads = [this](const std::function<void(int)>& task) {
-            data.threads.execute([&task](OpenMM::ThreadPool&, int thread) { task(thread); });
+            data.threads.execute([&task](OpenMM::ThreadPool&, int thread) {
+                if (thread > 0)
+                    task(thread);
+            });
+            task(0);
             data.threads.waitForThreads();
         };
         dynamics->setParallel(runOnThreads, data.threads.getNumThreads());
