@@ -135,11 +135,12 @@ private:
         const Clock::time_point start = Clock::now();
         if (choice.isParallel()) {
             const int numThreads = (int) results.size();
-            parallel([&](int thread) {
+            auto runShare = [&](int thread) {
                 Result own; // on the thread's own stack, away from those of others
                 share(thread, numThreads, own);
                 results[thread] = own;
-            });
+            };
+            parallel(std::ref(runShare)); // which a std::function holds without allocating memory
             for (const Result& each : results)
                 result.merge(each);
         }

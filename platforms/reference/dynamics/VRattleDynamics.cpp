@@ -330,9 +330,12 @@ double VRattleDynamics::step(double maxStep) {
 
 bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
-    vector<double> backValues;
-    const bool hasBack = isStart && evaluateBackwards(forces, energy, backValues);
-    const vector<double> startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
+    vector<double> backValues, startValues;
+    bool hasBack = false;
+    if (isStart) {
+        hasBack = evaluateBackwards(forces, energy, backValues);
+        startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
+    }
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
     evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
                    withHalfStep);
