@@ -9,7 +9,7 @@ applyVelocityConstraints, that is SETTLE for rigid waters and CCMA for everythin
 and the same velocities. Where OpenMM's solver misses an error, its tolerance is tightened as long as that may help.
 
 A table and one JSON line a measurement are printed. How the cost grows with the number of constraints is in scaling.py,
-and so is a chain of a million bonds beside OpenMM's solver, of which a Context takes OpenMM half an hour.
+and so is a chain of a million bonds beside OpenMM's solver, of which a Context takes OpenMM most of an hour.
 
     python benchmarks/constraints.py [--system water ...] [--repeats 7]
 """

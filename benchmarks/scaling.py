@@ -5,7 +5,7 @@
 Steps of our solver alone, without forces, for rigid waters, proteins with bonds to hydrogen and with all bonds fixed
 (many copies of one of 159 residues), and one polymer chain. Beside them, for chains as long as --context says, what
 OpenMM's own solver (CCMA) takes: to prepare it, which OpenMM does for every Context of the platforms Reference and CPU,
-with whatever integrator (half an hour for a million bonds), and to constrain the positions and velocities of a step.
+with whatever integrator (most of an hour for a million bonds), and to constrain the positions and velocities of a step.
 
 A table and one JSON line a measurement are printed. `make scaling` builds the program solver.cpp and runs this.
 
