@@ -38,6 +38,21 @@ inline int runTests(const TestList& tests) {
     return numFailed == 0 ? 0 : 1;
 }
 
+/**
+ * In place of a pool of threads: what they would do at once is done one after the other, the last thread's share first, since
+ * the order must not matter.
+ *
+ * @param numThreads    the number of threads
+ * @param calls         counts how often the pool is asked; it must live as long as the result
+ */
+inline std::function<void(const std::function<void(int)>&)> runInReverse(int numThreads, int& calls) {
+    return [numThreads, &calls](const std::function<void(int)>& task) {
+        calls++;
+        for (int thread = numThreads - 1; thread >= 0; thread--)
+            task(thread);
+    };
+}
+
 /** Assert that an action throws an exception whose text contains something. */
 template <class Action> void assertThrows(const std::string& text, Action action) {
 #ifdef __SANITIZE_ADDRESS__

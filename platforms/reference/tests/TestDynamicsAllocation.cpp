@@ -84,12 +84,8 @@ static Example makeExample() {
 void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int numThreads) {
     VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
     ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
-    dynamics.setParallel(
-        [numThreads](const std::function<void(int)>& task) {
-            for (int thread = 0; thread < numThreads; thread++)
-                task(thread);
-        },
-        numThreads);
+    int calls = 0;
+    dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
     dynamics.setSettings(settings);
     vector<Vec3> forces(e.masses.size());
     dynamics.begin(e.positions, e.velocities, forces, 0);
@@ -105,6 +101,7 @@ void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int 
     const long long before = numAllocations;
     takeSteps(20);
     ASSERT_EQUAL(before, (long long) numAllocations);
+    ASSERT((calls > 0) == (numThreads > 1));
 }
 
 int main() {

@@ -337,19 +337,12 @@ void testThreads(const Example& e) {
         for (int numThreads : {1, 2, 3, 8}) {
             VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
             int calls = 0;
-            // Threads one after the other, in reverse: their order must not matter.
-            dynamics.setParallel(
-                [&](const std::function<void(int)>& task) {
-                    calls++;
-                    for (int thread = numThreads - 1; thread >= 0; thread--)
-                        task(thread);
-                },
-                numThreads);
+            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
             dynamics.setSettings(settings);
             dynamics.begin(e.positions, e.velocities, forcesAt(e.positions), 0);
             if (settings.isAutomatic)
                 dynamics.startAutomatic({3300, 3200}, {3100, 3000});
-            takeSteps(dynamics, 6); // some of them on one thread
+            takeSteps(dynamics, ThreadChoice::RUN_LENGTH + 3); // the last ones on one thread
             ASSERT((calls > 0) == (numThreads > 1));
             if (numThreads == 1) {
                 positions = dynamics.getPositions();

@@ -208,16 +208,9 @@ void testThreads() {
         for (int numThreads : {1, 2, 3, 8}) {
             VRattleDynamics dynamics(e.masses, e.constraints);
             int calls = 0;
-            // Threads one after the other, in reverse: their order must not matter.
-            dynamics.setParallel(
-                [&](const std::function<void(int)>& task) {
-                    calls++;
-                    for (int thread = numThreads - 1; thread >= 0; thread--)
-                        task(thread);
-                },
-                numThreads);
+            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
             dynamics.setSettings(settings);
-            run(dynamics, e, 5, settings.isAutomatic);
+            run(dynamics, e, ThreadChoice::RUN_LENGTH + 3, settings.isAutomatic); // the last ones on one thread
             ASSERT((calls > 0) == (numThreads > 1));
             if (numThreads == 1) {
                 positions = dynamics.getPositions();
