@@ -16,7 +16,7 @@ DOCS_TOOLS := $(VENV)/.docs-tools-installed
 PACKAGE_TOOLS := $(VENV)/.package-tools-installed
 # What `make wheel` and `make sdist` give to pytest, for example "-k wrapper".
 PYTEST_ARGUMENTS ?=
-CXX_FILES = $(shell find openmmapi platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
+CXX_FILES = $(shell find openmmapi method platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
 .PHONY: all demo test check-format cxx-test sanitize scaling python-test docs pictures wheel sdist conda install format clean
 

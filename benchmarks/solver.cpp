@@ -7,7 +7,7 @@
 //
 //     solver PROBLEM STEP STEPS REPEATS Explicit|SemiExplicit THREADS
 
-#include "VRattleDynamics.h"
+#include "step/VRattleDynamics.h"
 #include "openmm/internal/ThreadPool.h"
 #include <algorithm>
 #include <chrono>

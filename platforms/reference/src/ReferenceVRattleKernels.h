@@ -4,9 +4,9 @@
 #ifndef OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 #define OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 
-#include "VRattleDynamics.h"
 #include "openmm/reference/ReferencePlatform.h"
 #include "openmmvrattle/VRattleKernels.h"
+#include "step/VRattleDynamics.h"
 #include <memory>
 #include <vector>
 

@@ -1,0 +1,477 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "constraints/ClusterBatch.h"
+#include "constraints/Pack.h"
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+// A cluster that has not converged after so many chord iterations is left to Newton's iteration.
+const int MAX_CHORD_ITERATIONS = 12;
+
+/** Bonds from particle 0 to each of the others: a diatomic, or CH_n. */
+template <int NumBonds> struct Star {
+    static constexpr int numBonds = NumBonds;
+    static constexpr int numParticles = NumBonds + 1;
+    static constexpr int first(int) {
+        return 0;
+    }
+    static constexpr int second(int bond) {
+        return bond + 1;
+    }
+};
+
+/** All three distances of three particles, such as a rigid water. */
+struct Triangle {
+    static constexpr int numBonds = 3;
+    static constexpr int numParticles = 3;
+    static constexpr int first(int bond) {
+        return bond == 2 ? 1 : 0;
+    }
+    static constexpr int second(int bond) {
+        return bond == 0 ? 1 : 2;
+    }
+};
+
+/** The sign with which a particle stands in a bond: 1 first, -1 second, 0 not at all. */
+template <class Topology> constexpr int signOf(int particle, int bond) {
+    return Topology::first(bond) == particle ? 1 : Topology::second(bond) == particle ? -1 : 0;
+}
+
+struct PackVector {
+    Pack x, y, z;
+};
+
+inline PackVector operator+(const PackVector& a, const PackVector& b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+inline PackVector operator-(const PackVector& a, const PackVector& b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+inline PackVector operator*(const PackVector& a, Pack s) {
+    return {a.x * s, a.y * s, a.z * s};
+}
+inline Pack dot(const PackVector& a, const PackVector& b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+template <class Topology> class BatchOf : public ClusterBatch {
+public:
+    static constexpr int B = Topology::numBonds;
+    static constexpr int P = Topology::numParticles;
+
+    BatchOf(const vector<double>& masses, const vector<double>& lengths, const vector<int>& particleTable,
+            int firstConstraint) :
+            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) particleTable.size() / P) {
+        for (int i = 0; i < P; i++)
+            inverseMass[i] = packOf(masses[i]);
+        for (int k = 0; k < B; k++) {
+            squareLength[k] = packOf(lengths[k] * lengths[k]);
+            inverseSquareLength[k] = packOf(1 / (lengths[k] * lengths[k]));
+        }
+        // C of K_kl = C_kl (row_k . row_l)
+        for (int k = 0; k < B; k++)
+            for (int l = 0; l < B; l++) {
+                double sum = 0;
+                for (int i = 0; i < P; i++)
+                    sum += signOf<Topology>(i, k) * signOf<Topology>(i, l) * masses[i];
+                massCoupling[k][l] = packOf(sum);
+            }
+    }
+
+    int getSize() const override {
+        return numClusters;
+    }
+    int findCluster(int particle) const override {
+        int first = 0, end = numClusters; // by bisection
+        while (first < end) {
+            const int middle = (first + end) / 2;
+            if (particles[(size_t) middle * P] < particle)
+                first = middle + 1;
+            else
+                end = middle;
+        }
+        return std::min(numClusters, (first + PACK_SIZE - 1) / PACK_SIZE * PACK_SIZE);
+    }
+    int getFirstConstraint(int cluster) const override {
+        return firstConstraint + cluster * B;
+    }
+    double solvePositions(const StepArrays& step, int first, int end, double tolerance, int& iterations) const override;
+    double coupledPass(const StepArrays& step, int first, int end) const override;
+    double finish(const OnStepArrays& step, int first, int end) const override;
+
+private:
+    /** Which clusters a pack holds. Where the last pack is not full its last cluster stands in all the lanes left. */
+    struct Lanes {
+        const int* particle[PACK_SIZE];
+        int constraint[PACK_SIZE];
+    };
+    /** G(q), by bonds, and K = L D L^T. */
+    struct Factor {
+        PackVector row[B];
+        Pack lower[B][B];
+        Pack inversePivot[B];
+    };
+
+    Lanes lanesOf(int cluster, int end) const {
+        Lanes lanes;
+        for (int lane = 0; lane < PACK_SIZE; lane++) {
+            int c = std::min(cluster + lane, end - 1);
+            lanes.particle[lane] = &particles[(size_t) c * P];
+            lanes.constraint[lane] = getFirstConstraint(c);
+        }
+        return lanes;
+    }
+    static PackVector load(const Lanes& lanes, int i, const Vec3* from) {
+        const Vec3 &a = from[lanes.particle[0][i]], &b = from[lanes.particle[1][i]];
+        return {Pack{a[0], b[0]}, Pack{a[1], b[1]}, Pack{a[2], b[2]}};
+    }
+    static void store(const Lanes& lanes, int i, const PackVector& x, Vec3* to) {
+        for (int lane = 0; lane < PACK_SIZE; lane++)
+            to[lanes.particle[lane][i]] = Vec3(x.x[lane], x.y[lane], x.z[lane]);
+    }
+    static Pack load(const Lanes& lanes, int k, const double* from) {
+        return Pack{from[lanes.constraint[0] + k], from[lanes.constraint[1] + k]};
+    }
+    static void store(const Lanes& lanes, int k, Pack x, double* to) {
+        for (int lane = 0; lane < PACK_SIZE; lane++)
+            to[lanes.constraint[lane] + k] = x[lane];
+    }
+    static PackVector bondOf(const PackVector* x, int k) {
+        return x[Topology::first(k)] - x[Topology::second(k)];
+    }
+    static void keepLargest(double& largest, Pack x) {
+        for (int lane = 0; lane < PACK_SIZE; lane++) {
+            double size = std::fabs(x[lane]);
+            if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
+                largest = size;
+        }
+    }
+
+    /** Rows and factor of K at bond vectors r. */
+    void factorize(const PackVector* r, Factor& factor) const;
+    /** The smallest D_k/K_kk of a factor. */
+    void keepSmallestPivot(const Factor& factor, double& smallest) const;
+    void solve(const Factor& factor, Pack* x) const;
+    /** result_k = sum_l C_kl x_l row_l: the bond vectors of M^-1 G^T x. */
+    void addConstraintBonds(const Factor& factor, const Pack* x, Pack scale, PackVector* bonds) const;
+    /** x_i += scale / mass * (G^T x)_i */
+    void addConstraintForces(const Factor& factor, const Pack* x, Pack scale, PackVector* particleVectors) const;
+    /** g = (|r|^2 - L^2)/(2 L^2). */
+    void evaluate(const PackVector* r, Pack* g) const {
+        for (int k = 0; k < B; k++)
+            g[k] = packOf(0.5) * (dot(r[k], r[k]) - squareLength[k]) * inverseSquareLength[k];
+    }
+
+    vector<int> particles;
+    int firstConstraint, numClusters;
+    Pack inverseMass[P], squareLength[B], inverseSquareLength[B], massCoupling[B][B];
+};
+
+template <class Topology> void BatchOf<Topology>::factorize(const PackVector* r, Factor& factor) const {
+    for (int k = 0; k < B; k++)
+        factor.row[k] = r[k] * inverseSquareLength[k];
+    for (int j = 0; j < B; j++) {
+        Pack scaled[B]; // L_jk D_k
+        Pack pivot = massCoupling[j][j] * dot(factor.row[j], factor.row[j]);
+        for (int k = 0; k < j; k++) {
+            scaled[k] = massCoupling[j][k] * dot(factor.row[j], factor.row[k]);
+            for (int l = 0; l < k; l++)
+                scaled[k] -= scaled[l] * factor.lower[k][l];
+        }
+        for (int k = 0; k < j; k++) {
+            factor.lower[j][k] = scaled[k] * factor.inversePivot[k];
+            pivot -= scaled[k] * factor.lower[j][k];
+        }
+        factor.inversePivot[j] = packOf(1) / pivot;
+    }
+}
+
+template <class Topology> void BatchOf<Topology>::keepSmallestPivot(const Factor& factor, double& smallest) const {
+    for (int k = 0; k < B; k++) {
+        Pack inverse = factor.inversePivot[k] * massCoupling[k][k] * dot(factor.row[k], factor.row[k]);
+        for (int lane = 0; lane < PACK_SIZE; lane++) {
+            double relative = 1 / inverse[lane];
+            if (relative < smallest || std::isnan(relative))
+                smallest = relative;
+        }
+    }
+}
+
+template <class Topology> void BatchOf<Topology>::solve(const Factor& factor, Pack* x) const {
+    for (int i = 1; i < B; i++)
+        for (int k = 0; k < i; k++)
+            x[i] -= factor.lower[i][k] * x[k];
+    for (int i = 0; i < B; i++)
+        x[i] = x[i] * factor.inversePivot[i];
+    for (int i = B - 1; i > 0; i--)
+        for (int k = 0; k < i; k++)
+            x[k] -= factor.lower[i][k] * x[i];
+}
+
+template <class Topology>
+void BatchOf<Topology>::addConstraintBonds(const Factor& factor, const Pack* x, Pack scale, PackVector* bonds) const {
+    PackVector force[B];
+    for (int l = 0; l < B; l++)
+        force[l] = factor.row[l] * (scale * x[l]);
+    for (int k = 0; k < B; k++)
+        for (int l = 0; l < B; l++)
+            bonds[k] = bonds[k] + force[l] * massCoupling[k][l];
+}
+
+template <class Topology>
+void BatchOf<Topology>::addConstraintForces(const Factor& factor, const Pack* x, Pack scale,
+                                            PackVector* particleVectors) const {
+    for (int k = 0; k < B; k++) {
+        const PackVector force = factor.row[k] * (scale * x[k]);
+        const int i = Topology::first(k), j = Topology::second(k);
+        particleVectors[i] = particleVectors[i] + force * inverseMass[i];
+        particleVectors[j] = particleVectors[j] - force * inverseMass[j];
+    }
+}
+
+template <class Topology>
+double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int end, double tolerance,
+                                         int& iterations) const {
+    const Pack kick = packOf(step.kick), drift = packOf(step.drift);
+    const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
+    double worst = 0;
+    for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
+        const Lanes lanes = lanesOf(cluster, end);
+        PackVector q[P], w[P], r[B], unconstrained[B], next[B];
+        for (int i = 0; i < P; i++) {
+            q[i] = load(lanes, i, step.q);
+            w[i] = load(lanes, i, step.start) + load(lanes, i, step.force) * (kick * inverseMass[i]);
+        }
+        for (int k = 0; k < B; k++) {
+            r[k] = bondOf(q, k);
+            unconstrained[k] = r[k] + bondOf(w, k) * drift;
+        }
+        Factor factor;
+        factorize(r, factor);
+        Pack lambda[B], g[B];
+        for (int k = 0; k < B; k++)
+            lambda[k] = load(lanes, k, step.lambda);
+        double error = 0, previous = std::numeric_limits<double>::infinity();
+        int iteration = 0;
+        while (true) {
+            std::copy(unconstrained, unconstrained + B, next);
+            addConstraintBonds(factor, lambda, scale, next);
+            evaluate(next, g);
+            error = 0;
+            for (int k = 0; k < B; k++)
+                keepLargest(error, g[k]);
+            // Where the error is no longer reduced it is rounding, or the caller's to deal with.
+            if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous)))
+                break;
+            if (iteration == MAX_CHORD_ITERATIONS)
+                break;
+            solve(factor, g);
+            for (int k = 0; k < B; k++)
+                lambda[k] += g[k] * inverseScale;
+            previous = error;
+            iteration++;
+        }
+        iterations = std::max(iterations, iteration);
+        if (error > worst || std::isnan(error))
+            worst = error;
+        addConstraintForces(factor, lambda, -kick, w);
+        for (int i = 0; i < P; i++) {
+            store(lanes, i, w[i], step.wNext);
+            store(lanes, i, q[i] + w[i] * drift, step.qNext);
+        }
+        for (int k = 0; k < B; k++)
+            store(lanes, k, lambda[k], step.lambda);
+    }
+    return worst;
+}
+
+template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays& step, int first, int end) const {
+    const Pack kick = packOf(step.kick), drift = packOf(step.drift), inverseDrift = packOf(1 / step.drift);
+    const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
+    double worst = 0;
+    for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
+        const Lanes lanes = lanesOf(cluster, end);
+        PackVector q[P], w[P], acceleration[P], r[B], next[B];
+        for (int i = 0; i < P; i++) {
+            q[i] = load(lanes, i, step.q);
+            acceleration[i] = load(lanes, i, step.force) * inverseMass[i];
+            w[i] = load(lanes, i, step.start) + acceleration[i] * kick;
+        }
+        for (int k = 0; k < B; k++) {
+            r[k] = bondOf(q, k);
+            next[k] = r[k] + bondOf(w, k) * drift;
+        }
+        Factor factor;
+        factorize(r, factor);
+        Pack lambda[B], g[B], multipliers[B];
+        for (int k = 0; k < B; k++) {
+            lambda[k] = load(lanes, k, step.lambda) + load(lanes, k, step.change);
+            store(lanes, k, lambda[k], step.lambda);
+        }
+        addConstraintBonds(factor, lambda, scale, next);
+        evaluate(next, g);
+        for (int k = 0; k < B; k++)
+            keepLargest(worst, g[k]);
+        // Lambda(q, p+) = K^-1 (g''(w+,w+) + G M^-1 F)
+        for (int k = 0; k < B; k++) {
+            const PackVector velocity = (next[k] - r[k]) * inverseDrift;
+            multipliers[k] =
+                dot(velocity, velocity) * inverseSquareLength[k] + dot(factor.row[k], bondOf(acceleration, k));
+            store(lanes, k, multipliers[k], step.rightSidePlus);
+        }
+        solve(factor, multipliers);
+        solve(factor, g);
+        for (int k = 0; k < B; k++) {
+            store(lanes, k, multipliers[k], step.lambdaPlus);
+            store(lanes, k, g[k] * inverseScale, step.change);
+        }
+        addConstraintForces(factor, lambda, -kick, w);
+        for (int i = 0; i < P; i++) {
+            store(lanes, i, w[i], step.wNext);
+            store(lanes, i, q[i] + w[i] * drift, step.qNext);
+        }
+    }
+    return worst;
+}
+
+template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& step, int first, int end) const {
+    const Pack kick = packOf(step.kick);
+    double smallestPivot = std::numeric_limits<double>::infinity();
+    for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
+        const Lanes lanes = lanesOf(cluster, end);
+        PackVector q[P], w[P], v[P], acceleration[P], r[B];
+        for (int i = 0; i < P; i++) {
+            q[i] = load(lanes, i, step.q);
+            w[i] = load(lanes, i, step.w);
+            acceleration[i] = load(lanes, i, step.force) * inverseMass[i];
+            v[i] = w[i] + acceleration[i] * kick;
+        }
+        for (int k = 0; k < B; k++)
+            r[k] = bondOf(q, k);
+        Factor factor;
+        factorize(r, factor);
+        keepSmallestPivot(factor, smallestPivot);
+        Pack x[B], applied[B], multipliers[B];
+        for (int k = 0; k < B; k++) {
+            x[k] = dot(factor.row[k], bondOf(v, k));
+            applied[k] = dot(factor.row[k], bondOf(acceleration, k));
+        }
+        solve(factor, x);
+        addConstraintForces(factor, x, packOf(-1), v);
+        for (int i = 0; i < P; i++)
+            store(lanes, i, v[i], step.v);
+        for (int k = 0; k < B; k++) {
+            const PackVector velocity = bondOf(v, k);
+            multipliers[k] = dot(velocity, velocity) * inverseSquareLength[k] + applied[k];
+            store(lanes, k, multipliers[k], step.rightSide);
+        }
+        solve(factor, multipliers);
+        for (int k = 0; k < B; k++)
+            store(lanes, k, multipliers[k], step.lambda);
+        if (step.lambdaHalf == nullptr)
+            continue;
+        addConstraintForces(factor, multipliers, packOf(-1), acceleration);
+        for (int k = 0; k < B; k++) {
+            const PackVector velocity = bondOf(w, k);
+            x[k] = dot(velocity, velocity) * inverseSquareLength[k] + applied[k];
+            store(lanes, k, x[k], step.rightSideHalf);
+            multipliers[k] = packOf(2) * dot(bondOf(v, k), bondOf(acceleration, k)) * inverseSquareLength[k];
+        }
+        solve(factor, x);
+        solve(factor, multipliers);
+        for (int k = 0; k < B; k++) {
+            store(lanes, k, x[k], step.lambdaHalf);
+            store(lanes, k, multipliers[k], step.lambdaRate);
+        }
+    }
+    return smallestPivot;
+}
+
+// The particle that all constraints of a star share; -1 if there is none. Of a single bond it is the first particle.
+int findCentre(const vector<DistanceConstraint>& cluster) {
+    for (int candidate : {cluster[0].particle1, cluster[0].particle2}) {
+        bool isShared = std::all_of(cluster.begin(), cluster.end(), [&](const DistanceConstraint& c) {
+            return c.particle1 == candidate || c.particle2 == candidate;
+        });
+        if (isShared)
+            return candidate;
+    }
+    return -1;
+}
+
+vector<int> findParticles(const vector<DistanceConstraint>& cluster) {
+    vector<int> particles;
+    for (const DistanceConstraint& c : cluster)
+        for (int i : {c.particle1, c.particle2})
+            if (std::find(particles.begin(), particles.end(), i) == particles.end())
+                particles.push_back(i);
+    return particles;
+}
+
+} // namespace
+
+bool ClusterBatch::isSupported(const vector<DistanceConstraint>& cluster) {
+    if (cluster.size() > 4)
+        return false;
+    const size_t numParticles = findParticles(cluster).size();
+    const bool isStar = findCentre(cluster) >= 0 && numParticles == cluster.size() + 1;
+    return isStar || (cluster.size() == 3 && numParticles == 3);
+}
+
+void ClusterBatch::arrange(const vector<DistanceConstraint>& cluster, vector<int>& order, vector<int>& particles) {
+    order.clear();
+    particles = findParticles(cluster);
+    if (particles.size() == 3 && cluster.size() == 3) {
+        // The particle of the two equal bonds first (the oxygen of a water), so that equal molecules make one batch.
+        for (int centre = 0; centre < 3; centre++) {
+            vector<double> lengths;
+            for (const DistanceConstraint& c : cluster)
+                if (c.particle1 == particles[centre] || c.particle2 == particles[centre])
+                    lengths.push_back(c.length);
+            if (lengths[0] == lengths[1]) {
+                std::rotate(particles.begin(), particles.begin() + centre, particles.begin() + centre + 1);
+                break;
+            }
+        }
+        for (auto pair : {std::make_pair(0, 1), {0, 2}, {1, 2}})
+            for (int k = 0; k < 3; k++) {
+                const DistanceConstraint& c = cluster[k];
+                int i = particles[pair.first], j = particles[pair.second];
+                if ((c.particle1 == i && c.particle2 == j) || (c.particle1 == j && c.particle2 == i))
+                    order.push_back(k);
+            }
+        return;
+    }
+    const int centre = findCentre(cluster);
+    particles = {centre};
+    for (int k = 0; k < (int) cluster.size(); k++) {
+        order.push_back(k);
+        particles.push_back(cluster[k].particle1 == centre ? cluster[k].particle2 : cluster[k].particle1);
+    }
+}
+
+std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<double>& inverseMasses,
+                                                   const vector<double>& lengths, const vector<int>& particles,
+                                                   int firstConstraint) {
+    typedef std::unique_ptr<ClusterBatch> Result;
+    if (isTriangle)
+        return Result(new BatchOf<Triangle>(inverseMasses, lengths, particles, firstConstraint));
+    switch (numBonds) {
+    case 1:
+        return Result(new BatchOf<Star<1>>(inverseMasses, lengths, particles, firstConstraint));
+    case 2:
+        return Result(new BatchOf<Star<2>>(inverseMasses, lengths, particles, firstConstraint));
+    case 3:
+        return Result(new BatchOf<Star<3>>(inverseMasses, lengths, particles, firstConstraint));
+    default:
+        return Result(new BatchOf<Star<4>>(inverseMasses, lengths, particles, firstConstraint));
+    }
+}

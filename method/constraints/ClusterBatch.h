@@ -1,0 +1,116 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_CLUSTERBATCH_H_
+#define OPENMMVRATTLE_CLUSTERBATCH_H_
+
+#include "constraints/ConstraintSystem.h"
+#include "openmm/Vec3.h"
+#include <memory>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The arrays and numbers of a step, as the cluster kernels see them. Particle arrays are in the order of the particles,
+ * constraint arrays in the internal order.
+ */
+struct StepArrays {
+    const OpenMM::Vec3* q;      // q[n]
+    const OpenMM::Vec3* start; // the velocities before the kick: M^-1 p[n-1/2], or v of a step from the on-step state
+    const OpenMM::Vec3* force; // F(q[n])
+    OpenMM::Vec3* qNext; // q[n+1]
+    OpenMM::Vec3* wNext; // M^-1 p[n+1/2]
+    double* lambda; // the multipliers of the step
+    double* change; // what the iteration adds to them next
+    double* lambdaPlus; // Lambda(q[n], p[n+1/2])
+    double* rightSidePlus; // K times it
+    double kick, drift; // w+ = start + kick M^-1 (F - G^T lambda), q+ = q + drift w+
+};
+
+/** The arrays of the second half of a step, at the new positions. */
+struct OnStepArrays {
+    const OpenMM::Vec3* q; // q[n+1]
+    const OpenMM::Vec3* w; // M^-1 p[n+1/2]
+    const OpenMM::Vec3* force; // F(q[n+1])
+    OpenMM::Vec3* v; // M^-1 p[n+1]
+    double* lambda; // Lambda(q[n+1], p[n+1])
+    double* rightSide; // K times it
+    double* lambdaHalf; // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and then none of the following
+    double* rightSideHalf; // K times it
+    double* lambdaRate; // the derivative of Lambda(q[n+1], p) along dp = F - G^T Lambda
+    double kick; // of (3.12), h/(2 rho)
+};
+
+/**
+ * Small clusters of one shape: the same topology, masses and lengths, such as all the waters of a box or all CH2 groups
+ * with the same bond length. All arithmetic of a step on a cluster is done in one pass, in registers, on PACK_SIZE
+ * clusters at a time; nothing is kept between passes but the multipliers.
+ */
+class ClusterBatch {
+public:
+    virtual ~ClusterBatch() {
+    }
+    /** The number of clusters. */
+    virtual int getSize() const = 0;
+    /**
+     * The first cluster whose first particle is not before a given one, rounded up to a multiple of PACK_SIZE. Clusters are in the
+     * order of their first particles.
+     */
+    virtual int findCluster(int particle) const = 0;
+    /** The first constraint of a cluster in the internal order. */
+    virtual int getFirstConstraint(int cluster) const = 0;
+    /**
+     * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by chord iterations, each cluster as
+     * many as it needs.
+     *
+     * @param tolerance    stop where the largest |g| of the cluster is this small, after at least one update
+     * @param[in,out] iterations    the number of updates of the cluster that needed most
+     * @return the largest |g| left; larger than the tolerance, or a NaN, if a cluster did not converge quickly
+     */
+    virtual double solvePositions(const StepArrays& step, int first, int end, double tolerance,
+                                  int& iterations) const = 0;
+    /**
+     * One pass of the coupled iteration: lambda += change, the positions and velocities from it, Lambda(q, p+), and the next
+     * change.
+     *
+     * @return the largest |g| before the next change
+     */
+    virtual double coupledPass(const StepArrays& step, int first, int end) const = 0;
+    /**
+     * The second half of a step for the clusters first, ..., end - 1.
+     *
+     * @return the smallest pivot of K relative to its diagonal entry, or a NaN
+     */
+    virtual double finish(const OnStepArrays& step, int first, int end) const = 0;
+
+    /** Whether there are kernels for clusters of this topology. */
+    static bool isSupported(const std::vector<DistanceConstraint>& cluster);
+    /**
+     * Put the constraints of a supported cluster, and the particles of each, into the order of its topology: a triangle as 01, 02,
+     * 12, a star as 01, 02, 03 with its centre first.
+     *
+     * @param cluster             the constraints
+     * @param[out] order          the constraint that comes k-th
+     * @param[out] particles      the particles of the cluster
+     */
+    static void arrange(const std::vector<DistanceConstraint>& cluster, std::vector<int>& order,
+                        std::vector<int>& particles);
+    /**
+     * Create a batch.
+     *
+     * @param numBonds           the number of constraints in a cluster
+     * @param isTriangle         whether the three particles of a cluster are all joined
+     * @param inverseMasses      1/mass of each particle of a cluster
+     * @param lengths            the length of each of its constraints
+     * @param particles          the particles, cluster after cluster
+     * @param firstConstraint    the first constraint of the batch in the internal order; the others follow, cluster after cluster
+     */
+    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle, const std::vector<double>& inverseMasses,
+                                                const std::vector<double>& lengths, const std::vector<int>& particles,
+                                                int firstConstraint);
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_CLUSTERBATCH_H_

@@ -1,0 +1,234 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "constraints/ConstraintSystem.h"
+#include <algorithm>
+#include <cmath>
+#include <set>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+std::string listParticles(const vector<int>& particles) {
+    const size_t maxListed = 12;
+    std::string text = particles.size() == 1 ? "particle " : "the particles ";
+    for (size_t i = 0; i < particles.size() && i < maxListed; i++)
+        text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
+    return particles.size() > maxListed ? text + ", ... (" + std::to_string(particles.size()) + " in all)" : text;
+}
+
+} // namespace
+
+void ConstraintSystem::setParameters(int expression, const std::map<std::string, double>& parameters) {
+    expressions[expression].parameters = parameters;
+    const std::pair<int, int>& place = placeInGroups[expression];
+    groups[place.first]->setParameters(place.second, parameters);
+}
+
+std::string ConstraintSystem::describe(int index) const {
+    if (!isExpression(index))
+        return "the constrained distance between the particles " + std::to_string(constraints[index].particle1) +
+               " and " + std::to_string(constraints[index].particle2);
+    const int e = givenIndex[index] - numGivenDistances;
+    return "expression constraint " + std::to_string(e) + " (" + expressions[e].expression + " = 0) of " +
+           listParticles(expressions[e].particles);
+}
+
+std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobian) const {
+    if (!isExpression(index))
+        return "";
+    const ExpressionRow& row = findRow(index);
+    double square = 0;
+    for (int entry = row.first; entry < row.end; entry++)
+        square += jacobian[entry].dot(jacobian[entry]);
+    if (square > 0 && std::isfinite(square))
+        return "";
+    return "the gradient of " + describe(index) +
+           (square == 0
+                ? " is zero, so that it can be held by no force; choose other positions, or write it such that its "
+                  "gradient does not vanish where it holds"
+                : " is not finite at these positions; choose others, or write it such that it has a derivative "
+                  "where it holds");
+}
+
+vector<int> ConstraintSystem::getClusterParticles(int cluster) const {
+    std::set<int> particles;
+    for (int k = clusters[cluster].first; k < clusters[cluster].first + clusters[cluster].size; k++) {
+        if (isExpression(k)) {
+            const vector<int>& members = expressions[givenIndex[k] - numGivenDistances].particles;
+            particles.insert(members.begin(), members.end());
+        }
+        else {
+            particles.insert(constraints[k].particle1);
+            particles.insert(constraints[k].particle2);
+        }
+    }
+    return vector<int>(particles.begin(), particles.end());
+}
+
+// How far the particles are from where an expression holds, to first order, in units of EXPRESSION_LENGTH.
+double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<double>& g, const Jacobian& nearby) const {
+    double square = 0;
+    for (int entry = row.first; entry < row.end; entry++)
+        square += nearby[entry].dot(nearby[entry]);
+    return std::fabs(g[row.constraint]) / (std::sqrt(square) * EXPRESSION_LENGTH);
+}
+
+// Do something for each distance constraint of a part.
+template <class Task> void ConstraintSystem::forDistances(const Part& part, const Task& task) const {
+    auto stretch = std::upper_bound(distanceStretches.begin(), distanceStretches.end(), part.first,
+                                    [](int k, const Stretch& each) { return k < each.end; });
+    for (; stretch != distanceStretches.end() && stretch->first < part.end; ++stretch) {
+        const int end = std::min(part.end, stretch->end);
+        for (int k = std::max(part.first, stretch->first); k < end; k++)
+            task(k);
+    }
+}
+
+// Do something for the row of each expression of a part.
+template <class Task> void ConstraintSystem::forRows(const Part& part, const Task& task) const {
+    const int end = std::min(part.endRow, (int) expressionRows.size());
+    for (int r = part.firstRow; r < end; r++)
+        task(expressionRows[r]);
+}
+
+// Do something for the expressions of a part, group by group.
+template <class Task> void ConstraintSystem::forGroups(const Part& part, const Task& task) const {
+    const int end = part.endGroupRange == ALL.endGroupRange ? (int) groups.size() : part.endGroupRange;
+    for (int r = part.firstGroupRange; r < end; r++)
+        task(*groups[groupRanges[r].group], groupRanges[r].first, groupRanges[r].end);
+}
+
+// The row of a constraint that is an expression.
+const ConstraintSystem::ExpressionRow& ConstraintSystem::findRow(int constraint) const {
+    return *std::lower_bound(expressionRows.begin(), expressionRows.end(), constraint,
+                             [](const ExpressionRow& row, int k) { return row.constraint < k; });
+}
+
+double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby,
+                                  const Part& part) const {
+    double largest = 0;
+    auto keepLargest = [&](double size) {
+        if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
+            largest = size;
+    };
+    forDistances(part, [&](int k) {
+        Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
+        double length = constraints[k].length;
+        g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
+        keepLargest(std::fabs(g[k]));
+    });
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) { group.evaluate(q, g, first, end); });
+    forRows(part, [&](const ExpressionRow& row) { keepLargest(findErrorOf(row, g, nearby)); });
+    return largest;
+}
+
+int ConstraintSystem::findLargest(const vector<double>& g, const Jacobian& nearby) const {
+    vector<double> errors = g;
+    for (const ExpressionRow& row : expressionRows)
+        errors[row.constraint] = findErrorOf(row, g, nearby);
+    int largest = 0;
+    for (int k = 1; k < getNumConstraints(); k++)
+        if (!(std::fabs(errors[k]) <= std::fabs(errors[largest])))
+            largest = k;
+    return largest;
+}
+
+// The distance constraints' part of G(x).
+void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jacobian, const Part& part) const {
+    forDistances(part, [&](int k) {
+        jacobian[k] = (x[constraints[k].particle1] - x[constraints[k].particle2]) * inverseSquareLengths[k];
+    });
+}
+
+void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, const Part& part) const {
+    evaluateDistanceRows(q, jacobian, part);
+    forGroups(part,
+              [&](ExpressionGroup& group, int first, int end) { group.evaluateJacobian(q, jacobian, first, end); });
+}
+
+void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, Jacobian& jacobian,
+                                                const Part& part) const {
+    evaluateDistanceRows(v, jacobian, part);
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+        group.evaluateVelocityJacobian(q, v, jacobian, first, end);
+    });
+}
+
+void ConstraintSystem::multiply(const Jacobian& jacobian, const vector<Vec3>& w, vector<double>& result,
+                                const Part& part) const {
+    forDistances(
+        part, [&](int k) { result[k] = jacobian[k].dot(w[constraints[k].particle1] - w[constraints[k].particle2]); });
+    forRows(part, [&](const ExpressionRow& row) {
+        double sum = 0;
+        for (int entry = row.first; entry < row.end; entry++)
+            sum += jacobian[entry].dot(w[getParticleOf(entry)]);
+        result[row.constraint] = sum;
+    });
+}
+
+void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<Vec3>& f, vector<double>& result,
+                                        const Part& part) const {
+    forDistances(part, [&](int k) {
+        int i = constraints[k].particle1, j = constraints[k].particle2;
+        result[k] = jacobian[k].dot(f[i] * inverseMasses[i] - f[j] * inverseMasses[j]);
+    });
+    forRows(part, [&](const ExpressionRow& row) {
+        double sum = 0;
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = getParticleOf(entry);
+            sum += jacobian[entry].dot(f[i]) * inverseMasses[i];
+        }
+        result[row.constraint] = sum;
+    });
+}
+
+void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result) const {
+    forDistances(ALL, [&](int k) {
+        Vec3 force = jacobian[k] * x[k];
+        result[constraints[k].particle1] += force;
+        result[constraints[k].particle2] -= force;
+    });
+    for (size_t e = 0; e < expressionEntries.size(); e++)
+        result[expressionEntries[e].particle] += jacobian[getNumConstraints() + e] * x[expressionEntries[e].constraint];
+}
+
+void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vector<double>& x, double scale,
+                                             vector<Vec3>& result, const Part& part) const {
+    forDistances(part, [&](int k) {
+        int i = constraints[k].particle1, j = constraints[k].particle2;
+        Vec3 force = jacobian[k] * (scale * x[k]);
+        result[i] += force * inverseMasses[i];
+        result[j] -= force * inverseMasses[j];
+    });
+    forRows(part, [&](const ExpressionRow& row) {
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = getParticleOf(entry);
+            result[i] += jacobian[entry] * (scale * x[row.constraint] * inverseMasses[i]);
+        }
+    });
+    for (int e = part.firstJointEnd; e < part.endJointEnd; e++) {
+        const JointEnd& end = jointEnds[e];
+        result[end.particle] +=
+            jacobian[end.entry] * (end.sign * scale * x[end.constraint] * inverseMasses[end.particle]);
+    }
+}
+
+void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result,
+                                         const Part& part) const {
+    forDistances(part, [&](int k) {
+        Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
+        result[k] = w.dot(w) * inverseSquareLengths[k];
+    });
+    forGroups(part,
+              [&](ExpressionGroup& group, int first, int end) { group.evaluateCurvature(q, v, result, first, end); });
+}
+
+void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, vector<double>& result) const {
+    result.assign(numGivenConstraints, 0.0);
+    for (int k = 0; k < getNumConstraints(); k++)
+        result[givenIndex[k]] = multipliers[k] * multiplierFactors[k];
+}

@@ -1,0 +1,335 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
+#define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
+
+#include "constraints/ClusterCut.h"
+#include "expressions/ExpressionGroup.h"
+#include "openmm/Vec3.h"
+#include <limits>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+class ClusterBatch;
+
+/** The distance between two particles is fixed: |q1 - q2| = length (nm). */
+struct DistanceConstraint {
+    int particle1, particle2;
+    double length;
+};
+
+/**
+ * The constraints g(q) = 0 of a system of particles, their Jacobian G = dg/dq, and the products with it that the method needs.
+ *
+ * Each distance constraint is written in relative form, g = (|r|^2 - L^2)/(2 L^2) with r = q1 - q2, so that g is the
+ * relative error of the distance and one tolerance serves all. Its row of G is r/L^2 on particle 1 and the opposite on
+ * particle 2. A multiplier of this form is 2 L^2 times the multiplier of |r|^2 - L^2; see toGivenMultiplier().
+ *
+ * A constraint given as an expression is taken as it is written, g(x1, y1, z1, x2, ...) = 0. Its error is measured as a
+ * distance, |g| over the norm of its gradient with respect to the particles that move, relative to EXPRESSION_LENGTH: so
+ * it is the same for g and for 1000 g, and one tolerance serves these constraints too.
+ *
+ * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
+ * neighbours: first the small clusters that come in batches of one shape, then the general ones, and of these the ones
+ * with an expression last. The functions below work on a part of them: all, one of getGeneralParts(), one of getPieces() of
+ * the large clusters, or the joints between these. Distance constraints between two particles of mass zero cannot move
+ * anything and are left out.
+ */
+class ConstraintSystem {
+public:
+    /**
+     * The rows of G, of length getNumEntries(). A distance constraint has one entry, its place in the internal order: the part
+     * of its row that acts on particle 1, 1/nm. The rows of expressions lie behind, an entry for each particle.
+     */
+    typedef std::vector<OpenMM::Vec3> Jacobian;
+    /**
+     * Neighbours in the internal order: the constraints first, ..., end - 1, which are whole clusters, or a piece of a large
+     * one, or the joints between its pieces. Parts that are not joints have no particle and no constraint in common, so that
+     * threads may work on them at the same time.
+     */
+    struct Part {
+        int first, end;
+        int firstRow, endRow;               // of getExpressionRows()
+        int firstGroupRange, endGroupRange; // the expressions by their groups
+        int firstParticle, endParticle;     // of getGeneralParticles()
+        int firstJointEnd, endJointEnd;     // what joints do to the particles of a piece
+        int piece;                          // in getPieces(), if it is one; else NONE
+    };
+    static constexpr int NONE = -1;
+    /** All constraints; with another beginning, all from there on. */
+    static constexpr Part ALL = {0,   std::numeric_limits<int>::max(),
+                                 0,   std::numeric_limits<int>::max(),
+                                 0,   std::numeric_limits<int>::max(),
+                                 0,   0,
+                                 0,   0,
+                                 NONE};
+    /** A large cluster in pieces, of which each is a part, and so are the joints. See ClusterCut. */
+    struct CutCluster {
+        int firstPiece, endPiece; // of getPieces()
+        Part joints;
+    };
+    /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
+    struct Cluster {
+        int first, size;
+    };
+    /**
+     * Where a block of neighbouring particles begins in the lists that are worked through block by block, so that what
+     * belongs together is in the processor's caches together.
+     */
+    struct Block {
+        std::vector<int> clusters; // the first cluster of each batch; a multiple of PACK_SIZE
+        int freeParticle;          // the first in getFreeParticles()
+        int particle;              // the first of all
+    };
+    /**
+     * Two constraints share a particle: an entry of K = G M^-1 G^T is the sum of factor * (row . column), row and column being
+     * entries of the Jacobian. The constraint of row (see getConstraintOf()) is never before that of column.
+     */
+    struct Coupling {
+        int row, column;
+        double factor; // +-1/mass of the shared particle, or 1/m1 + 1/m2 on the diagonal of a distance constraint
+    };
+    /** The row of an expression has the entries first, ..., end - 1 of a Jacobian. */
+    struct ExpressionRow {
+        int constraint, first, end;
+    };
+    /** An entry of an expression's row. */
+    struct ExpressionEntry {
+        int constraint, particle;
+    };
+    /** Errors of expressions are relative to this distance (nm), which is about that of a bond. */
+    static constexpr double EXPRESSION_LENGTH = 0.1;
+
+    /**
+     * @param masses         the mass of each particle (amu); 0 for a particle that does not move
+     * @param constraints    the distance constraints
+     * @param expressions    the constraints given as expressions, of at least one particle with mass each
+     */
+    ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                     const std::vector<ExpressionConstraint>& expressions = {});
+    ~ConstraintSystem();
+
+    int getNumParticles() const {
+        return (int) masses.size();
+    }
+    int getNumConstraints() const {
+        return (int) constraints.size();
+    }
+    /** The number of constraints of both kinds that were given to the constructor, with those that were left out. */
+    int getNumGivenConstraints() const {
+        return numGivenConstraints;
+    }
+    const std::vector<double>& getMasses() const {
+        return masses;
+    }
+    /** 1/mass, and 0 for a particle of mass zero. */
+    const std::vector<double>& getInverseMasses() const {
+        return inverseMasses;
+    }
+    /** The length of a Jacobian. */
+    int getNumEntries() const {
+        return getNumConstraints() + (int) expressionEntries.size();
+    }
+    /** Whether a constraint is given as an expression. */
+    bool isExpression(int index) const {
+        return !expressions.empty() && givenIndex[index] >= numGivenDistances;
+    }
+    /** A distance constraint. */
+    const DistanceConstraint& getConstraint(int index) const {
+        return constraints[index];
+    }
+    const std::vector<ExpressionRow>& getExpressionRows() const {
+        return expressionRows;
+    }
+    /** The particle on which an entry of an expression's row acts. */
+    int getParticleOf(int entry) const {
+        return expressionEntries[entry - getNumConstraints()].particle;
+    }
+    /** The constraint that an entry of a Jacobian belongs to. */
+    int getConstraintOf(int entry) const {
+        return entry < getNumConstraints() ? entry : expressionEntries[entry - getNumConstraints()].constraint;
+    }
+    /** Change the parameters of an expression, counted in the order of the constructor. */
+    void setParameters(int expression, const std::map<std::string, double>& parameters);
+    /** A constraint in words, for messages. */
+    std::string describe(int index) const;
+    const std::vector<Cluster>& getClusters() const {
+        return clusters;
+    }
+    const std::vector<Coupling>& getCouplings() const {
+        return couplings;
+    }
+    /** The batches of small clusters, whose constraints come first in the internal order. */
+    const std::vector<std::unique_ptr<ClusterBatch>>& getBatches() const {
+        return batches;
+    }
+    /** The beginnings of the blocks, and at last the end of all. */
+    const std::vector<Block>& getBlocks() const {
+        return blocks;
+    }
+    /** The first constraint that is in no batch. */
+    int getFirstGeneral() const {
+        return firstGeneral;
+    }
+    /**
+     * The general clusters that are not cut, in parts: each is a few clusters that are worked through together while the
+     * processor's caches have them.
+     */
+    const std::vector<Part>& getGeneralParts() const {
+        return generalParts;
+    }
+    /** The pieces of all large clusters. */
+    const std::vector<Part>& getPieces() const {
+        return pieces;
+    }
+    const std::vector<CutCluster>& getCutClusters() const {
+        return cutClusters;
+    }
+    /** The particles with mass whose cluster is in no batch, part by part. */
+    const std::vector<int>& getGeneralParticles() const {
+        return generalParticles;
+    }
+    /** The particles with mass that have no constraint. */
+    const std::vector<int>& getFreeParticles() const {
+        return freeParticles;
+    }
+    /** Whether a motion of all particles with mass at one velocity satisfies the constraints: none holds a fixed particle. */
+    bool isTranslationInvariant() const {
+        return isFreeToTranslate;
+    }
+    /** The particles of a cluster, in increasing order. */
+    std::vector<int> getClusterParticles(int cluster) const;
+
+    /**
+     * g(q) in g.
+     *
+     * @param nearby    the Jacobian at q or nearby, which gives the errors of expressions their length
+     * @return the largest relative error of a constraint, or a NaN
+     */
+    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, const Jacobian& nearby,
+                    const Part& part = ALL) const;
+    /** The index of the constraint with the largest relative error. */
+    int findLargest(const std::vector<double>& g, const Jacobian& nearby) const;
+    /** G(q), the Jacobian. */
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, const Part& part = ALL) const;
+    /**
+     * G(v), the matrix whose rows are (d^2g/dq^2 v)^T at q: half the derivative of g''(v,v) with respect to v. For distance
+     * constraints it is the Jacobian with v in place of q, since they are quadratic (paper, Lemma 4.1).
+     */
+    void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                                  Jacobian& jacobian, const Part& part = ALL) const;
+    /** G w. */
+    void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
+                  const Part& part = ALL) const;
+    /** G M^-1 f. */
+    void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f, std::vector<double>& result,
+                          const Part& part = ALL) const;
+    /** result += G^T x, as forces on the particles. */
+    void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
+    /** result += scale M^-1 G^T x; for a piece, what all constraints do to its particles. */
+    void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
+                               std::vector<OpenMM::Vec3>& result, const Part& part = ALL) const;
+    /** g''(v,v), the second derivative of the constraints along v at q. */
+    void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                           std::vector<double>& result, const Part& part = ALL) const;
+    /**
+     * The factor that turns a multiplier of constraint index into that of the constraint as users see it: |r|^2 - L^2
+     * (kJ/mol/nm^2) for a distance, and the expression itself (kJ/mol over the unit of g), whose factor is 1.
+     */
+    double toGivenMultiplier(int index) const {
+        return multiplierFactors[index];
+    }
+    /** Bring multipliers into the order of the constructor, distances first, and into the users' units. */
+    void getGivenMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
+    /** Say in words what is wrong with a constraint whose gradient is zero or not finite; empty if neither is so. */
+    std::string explainGradient(int index, const Jacobian& jacobian) const;
+
+private:
+    /** A stretch of distance constraints in the internal order: first, ..., end - 1. */
+    struct Stretch {
+        int first, end;
+    };
+    /** What the constructor works on: constraints of both kinds, distances first. */
+    struct Given {
+        const std::vector<DistanceConstraint>& distances;
+        const std::vector<ExpressionConstraint>& expressions;
+        int getSize() const {
+            return (int) (distances.size() + expressions.size());
+        }
+        bool isExpression(int k) const {
+            return k >= (int) distances.size();
+        }
+        const ExpressionConstraint& getExpression(int k) const {
+            return expressions[k - distances.size()];
+        }
+    };
+    /** A cluster that is in no batch: the constraints of the whole, or of each piece, and the joints. */
+    struct GeneralCluster {
+        std::vector<ClusterCut::Piece> pieces;
+        std::vector<int> joints;
+    };
+    /** Constraints of an expression group that are in one part: the places first, ..., end - 1 in the group. */
+    struct GroupRange {
+        int group, first, end;
+    };
+    /** What a joint does to a particle. */
+    struct JointEnd {
+        int entry, constraint, particle;
+        double sign;
+    };
+    std::vector<int> findMovingParticles(const Given& given, int k) const;
+    std::vector<std::vector<int>> findClusters(const Given& given, const std::vector<int>& members) const;
+    void orderForElimination(const Given& given, std::vector<int>& cluster) const;
+    std::vector<int> walkThroughParticles(const Given& given, const std::vector<int>& cluster,
+                                          const std::map<int, std::vector<int>>& constraintsOf) const;
+    std::vector<int> walkThroughConstraints(const Given& given, const std::vector<int>& cluster,
+                                            const std::map<int, std::vector<int>>& constraintsOf) const;
+    GeneralCluster cutAndOrder(const Given& given, const std::vector<int>& cluster) const;
+    void orderPiece(const Given& given, std::vector<int>& piece) const;
+    void orderJoints(const Given& given, GeneralCluster& cluster) const;
+    void append(const Given& given, const std::vector<int>& members);
+    void groupExpressions(const Given& given);
+    void findStretches();
+    void findCouplings();
+    void findParts(const std::vector<GeneralCluster>& general);
+    void findGroupRanges();
+    void findJointEnds();
+    void findFreeParticles(const std::vector<char>& isInBatch);
+    void findBlocks();
+    template <class Task> void forDistances(const Part& part, const Task& task) const;
+    template <class Task> void forRows(const Part& part, const Task& task) const;
+    template <class Task> void forGroups(const Part& part, const Task& task) const;
+    const ExpressionRow& findRow(int constraint) const;
+    void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
+    double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
+    int numGivenConstraints, numGivenDistances, firstGeneral;
+    bool isFreeToTranslate;
+    std::vector<double> masses, inverseMasses;
+    std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning
+    std::vector<int> givenIndex;                 // internal order -> order of the constructor
+    std::vector<double> inverseSquareLengths, multiplierFactors;
+    std::vector<Stretch> distanceStretches;
+    std::vector<ExpressionConstraint> expressions; // in the order of the constructor
+    std::vector<std::unique_ptr<ExpressionGroup>> groups;
+    std::vector<std::pair<int, int>> placeInGroups; // group and number therein of each expression
+    std::vector<GroupRange> groupRanges; // first each group as a whole, then those of the parts
+    std::vector<ExpressionRow> expressionRows; // in internal order, and their entries too
+    std::vector<ExpressionEntry> expressionEntries;
+    std::vector<Cluster> clusters;
+    std::vector<Coupling> couplings;
+    std::vector<std::unique_ptr<ClusterBatch>> batches;
+    std::vector<Block> blocks;
+    std::vector<Part> generalParts, pieces;
+    std::vector<CutCluster> cutClusters;
+    std::vector<JointEnd> jointEnds;
+    std::vector<int> generalParticles, freeParticles;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_CONSTRAINTSYSTEM_H_

@@ -1,0 +1,46 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_NEWTONMATRIX_H_
+#define OPENMMVRATTLE_NEWTONMATRIX_H_
+
+#include "constraints/ConstraintSystem.h"
+#include <Eigen/Core>
+#include <Eigen/LU>
+#include <Eigen/SparseCore>
+#include <Eigen/SparseLU>
+#include <memory>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The unsymmetric matrix G(q+) M^-1 G(q)^T of the full Newton iteration (docs/method.md, section 8: A up to a factor),
+ * block by block. It is the fall-back where the chord iteration with K(q) converges slowly, so its memory is taken at
+ * the first use.
+ */
+class NewtonMatrix {
+public:
+    explicit NewtonMatrix(const ConstraintSystem& system);
+    /** Compute and factorise the matrix; returns whether it is regular. */
+    bool factorize(const ConstraintSystem::Jacobian& next, const ConstraintSystem::Jacobian& current);
+    /** Replace x by the solution of A y = x. */
+    void solve(std::vector<double>& x) const;
+
+private:
+    typedef Eigen::SparseMatrix<double> SparseMatrix;
+    struct Block {
+        int first, size;
+        size_t firstCoupling, endCoupling;
+        Eigen::MatrixXd dense;
+        Eigen::PartialPivLU<Eigen::MatrixXd> denseFactor;
+        SparseMatrix sparse;
+        std::unique_ptr<Eigen::SparseLU<SparseMatrix>> sparseFactor;
+    };
+    const ConstraintSystem& system;
+    std::vector<Block> blocks;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_NEWTONMATRIX_H_

@@ -1,0 +1,162 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_SHAREDWORK_H_
+#define OPENMMVRATTLE_SHAREDWORK_H_
+
+#include "constraints/ClusterBatch.h"
+#include "constraints/ConstraintMatrix.h"
+#include "constraints/ConstraintSystem.h"
+#include "constraints/ThreadChoice.h"
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <functional>
+#include <limits>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * Goes through all clusters and free particles of a system with some tasks, on several threads where that is faster. What a task does
+ * with one cluster, piece or block never depends on the number of threads, so that results do not either, to the last bit.
+ */
+class SharedWork {
+public:
+    /** Runs a task on several threads at once, as task(thread), and returns when all have ended. */
+    typedef std::function<void(const std::function<void(int)>&)> Parallel;
+
+    /** What tasks find: the largest error, the smallest pivot (a NaN counts), and the like. */
+    struct Result {
+        double error = 0, pieceError = 0, pivot = std::numeric_limits<double>::infinity();
+        int iterations = 0, failed = ConstraintMatrix::REGULAR;
+        void addError(double other) {
+            error = larger(error, other);
+        }
+        void addPieceError(double other) {
+            pieceError = larger(pieceError, other);
+        }
+        void addPivot(double other) {
+            pivot = -larger(-pivot, -other);
+        }
+        void addFailed(int other) {
+            failed = std::max(failed, other);
+        }
+        void merge(const Result& other) {
+            addError(other.error);
+            addPieceError(other.pieceError);
+            addPivot(other.pivot);
+            addFailed(other.failed);
+            iterations = std::max(iterations, other.iterations);
+        }
+    };
+
+    explicit SharedWork(const ConstraintSystem& system) : system(system), seconds(0) {
+    }
+    void setParallel(const Parallel& newParallel, int numThreads) {
+        parallel = numThreads > 1 ? newParallel : Parallel();
+        results.resize(numThreads);
+    }
+    /** A step begins; how its work is shared stays the same until it ends. */
+    void beginStep() {
+        seconds = 0;
+    }
+    void endStep() {
+        choice.add(seconds);
+    }
+
+    /**
+     * Go through all particles block by block, calling blockTask(block), a task for what each batch has there, batchTask(batch, first
+     * cluster, end, result), and one for particles without constraints, freeTask(particle); then through the parts of whole clusters,
+     * partTask(part, result), and the pieces of those that are cut, pieceTask(piece, result). A cluster is worked on in the same lane
+     * of a pack whatever the number of threads, since blocks begin at whole packs.
+     */
+    template <class BlockTask, class BatchTask, class FreeTask, class PartTask, class PieceTask>
+    Result run(const BlockTask& blockTask, const BatchTask& batchTask, const FreeTask& freeTask,
+               const PartTask& partTask, const PieceTask& pieceTask) {
+        const auto& batches = system.getBatches();
+        const auto& blocks = system.getBlocks();
+        const std::vector<int>& freeParticles = system.getFreeParticles();
+        return runOnThreads([&](int thread, int numThreads, Result& result) {
+            forShare(blocks.size() - 1, thread, numThreads, [&](size_t b) {
+                blockTask((int) b);
+                for (size_t k = 0; k < batches.size(); k++) {
+                    const int first = blocks[b].clusters[k], end = blocks[b + 1].clusters[k];
+                    if (first < end)
+                        batchTask(*batches[k], first, end, result);
+                }
+                for (int k = blocks[b].freeParticle; k < blocks[b + 1].freeParticle; k++)
+                    freeTask(freeParticles[k]);
+            });
+            forShare(system.getGeneralParts().size(), thread, numThreads,
+                     [&](size_t k) { partTask(system.getGeneralParts()[k], result); });
+            forShare(system.getPieces().size(), thread, numThreads,
+                     [&](size_t k) { pieceTask(system.getPieces()[k], result); });
+        });
+    }
+    /** Run a task on the pieces of cut clusters alone: task(piece, result). */
+    template <class PieceTask> Result runOnPieces(const PieceTask& task) {
+        if (system.getPieces().empty())
+            return Result();
+        return runOnThreads([&](int thread, int numThreads, Result& result) {
+            forShare(system.getPieces().size(), thread, numThreads,
+                     [&](size_t k) { task(system.getPieces()[k], result); });
+        });
+    }
+    /** Run a task on each cut cluster, for its joints, when that on the pieces has ended: task(cluster). */
+    template <class JointTask> void runOnJoints(const JointTask& task) const {
+        for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters())
+            task(cluster);
+    }
+
+    /** The larger of two numbers, or a NaN if one is. */
+    static double larger(double a, double b) {
+        return a >= b || std::isnan(a) ? a : b;
+    }
+
+private:
+    // Threads may share the work from this number of constraints on. A pass costs 10 to 25 ns a constraint, and a call of the
+    // thread pool 5 us at the least.
+    static constexpr int MIN_PARALLEL_CONSTRAINTS = 2000;
+
+    template <class Task> static void forShare(size_t count, int thread, int numThreads, const Task& task) {
+        const size_t end = count * (thread + 1) / numThreads;
+        for (size_t k = count * thread / numThreads; k < end; k++)
+            task(k);
+    }
+    // Call share(thread, number of threads, result) on each thread, or once if that is faster.
+    template <class Share> Result runOnThreads(const Share& share) {
+        Result result;
+        if (!parallel || system.getNumConstraints() < MIN_PARALLEL_CONSTRAINTS) {
+            share(0, 1, result);
+            return result;
+        }
+        typedef std::chrono::steady_clock Clock;
+        const Clock::time_point start = Clock::now();
+        if (choice.isParallel()) {
+            const int numThreads = (int) results.size();
+            auto runShare = [&](int thread) {
+                Result own; // on the thread's own stack, away from those of others
+                share(thread, numThreads, own);
+                results[thread] = own;
+            };
+            parallel(std::ref(runShare)); // which a std::function holds without allocating memory
+            for (const Result& each : results)
+                result.merge(each);
+        }
+        else
+            share(0, 1, result);
+        seconds += std::chrono::duration<double>(Clock::now() - start).count();
+        return result;
+    }
+
+    const ConstraintSystem& system;
+    Parallel parallel; // empty: one thread
+    std::vector<Result> results;
+    ThreadChoice choice;
+    double seconds; // spent in this step
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_SHAREDWORK_H_

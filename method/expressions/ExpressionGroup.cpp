@@ -1,0 +1,156 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "expressions/ExpressionGroup.h"
+#include "lepton/ParsedExpression.h"
+#include "lepton/Parser.h"
+#include <algorithm>
+#include <utility>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::string;
+using std::vector;
+
+ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParticles((int) example.particles.size()) {
+    const char* const axes[] = {"x", "y", "z"};
+    for (int i = 0; i < 3 * numParticles; i++)
+        coordinates.push_back(graph.addVariable(axes[i % 3] + std::to_string(i / 3 + 1)));
+    for (const auto& parameter : example.parameters) {
+        parameterNames.push_back(parameter.first);
+        parameters.push_back(graph.addVariable(parameter.first));
+    }
+    // Not optimized by Lepton, which for a constant that is not a number would go on for ever; the graph does it.
+    value = graph.addExpression(Lepton::Parser::parse(example.expression).getRootNode());
+    // These names can not be written in an expression.
+    vector<std::pair<int, int>> rates;
+    for (int i = 0; i < 3 * numParticles; i++) {
+        velocities.push_back(graph.addVariable("velocity " + std::to_string(i)));
+        rates.emplace_back(coordinates[i], velocities[i]);
+    }
+    rate = graph.differentiate(value, rates);
+    curvature = graph.differentiate(rate, rates);
+}
+
+void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int firstEntry,
+                          const vector<double>& inverseMasses) {
+    indices.push_back(index);
+    firstEntries.push_back(firstEntry);
+    for (int i : constraint.particles) {
+        particles.push_back(i);
+        isMoving.push_back(inverseMasses[i] > 0);
+    }
+    parameterValues.resize(parameterValues.size() + parameters.size());
+    setParameters(getNumConstraints() - 1, constraint.parameters);
+}
+
+void ExpressionGroup::setParameters(int n, const std::map<string, double>& newParameters) {
+    for (size_t i = 0; i < parameterNames.size(); i++)
+        parameterValues[n * parameterNames.size() + i] = newParameters.at(parameterNames[i]);
+}
+
+// A program, made when it is first needed, which may be by several threads at once.
+const ArrayExpression& ExpressionGroup::require(Program& program, const std::function<vector<int>()>& findOutputs) {
+    std::lock_guard<std::mutex> lock(mutex);
+    if (program == nullptr) {
+        vector<int> inputs = coordinates;
+        inputs.insert(inputs.end(), velocities.begin(), velocities.end());
+        inputs.insert(inputs.end(), parameters.begin(), parameters.end());
+        const vector<int> outputs = findOutputs();
+        program.reset(new ArrayExpression(graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
+    }
+    return *program;
+}
+
+// Run a program on the constraints of a range, block by block, and call store(work, first, count) after each.
+template <class Store>
+void ExpressionGroup::run(const ArrayExpression& program, const Range& range, const Store& store) const {
+    const int numCoordinates = 3 * numParticles, numParameters = (int) parameters.size();
+    thread_local vector<double> memory; // of the thread, since others may be at work on other ranges
+    memory.resize(std::max(memory.size(), program.getWorkSize()));
+    double* const work = memory.data();
+    program.prepare(work);
+    double unused[MAX_BLOCK_SIZE]; // what the program does not read
+    // Where the inputs index, index + 1, index + 2 go; whether any of them is needed.
+    auto findInputs = [&](int index, double** inputs) {
+        bool isAnyUsed = false;
+        for (int j = 0; j < 3; j++) {
+            const bool isUsed = program.usesInput(index + j);
+            inputs[j] = isUsed ? program.getInput(work, index + j) : unused;
+            isAnyUsed |= isUsed;
+        }
+        return isAnyUsed;
+    };
+    for (int first = range.first; first < range.end; first += MAX_BLOCK_SIZE) {
+        const int count = std::min(MAX_BLOCK_SIZE, range.end - first);
+        const int* block = &particles[(size_t) first * numParticles];
+        const char* moving = &isMoving[(size_t) first * numParticles];
+        for (int p = 0; p < numParticles; p++) {
+            double* x[3];
+            if (findInputs(3 * p, x))
+                for (int n = 0; n < count; n++) {
+                    const Vec3& position = range.q[block[n * numParticles + p]];
+                    x[0][n] = position[0];
+                    x[1][n] = position[1];
+                    x[2][n] = position[2];
+                }
+            // A particle without mass stays where it is, whatever velocity it has been given.
+            if (findInputs(numCoordinates + 3 * p, x))
+                for (int n = 0; n < count; n++) {
+                    const int place = n * numParticles + p;
+                    const Vec3 velocity = moving[place] ? (*range.v)[block[place]] : Vec3();
+                    x[0][n] = velocity[0];
+                    x[1][n] = velocity[1];
+                    x[2][n] = velocity[2];
+                }
+        }
+        for (int i = 0; i < numParameters; i++)
+            if (program.usesInput(2 * numCoordinates + i)) {
+                double* input = program.getInput(work, 2 * numCoordinates + i);
+                for (int n = 0; n < count; n++)
+                    input[n] = parameterValues[(size_t) (first + n) * numParameters + i];
+            }
+        program.evaluate(work, count);
+        store(work, first, count);
+    }
+}
+
+void ExpressionGroup::runValues(const ArrayExpression& program, const Range& range, vector<double>& result) const {
+    run(program, range, [&](const double* work, int first, int count) {
+        const double* output = program.getOutput(work, 0);
+        for (int n = 0; n < count; n++)
+            result[indices[first + n]] = output[n];
+    });
+}
+
+void ExpressionGroup::runRows(const ArrayExpression& program, const Range& range, vector<Vec3>& jacobian) const {
+    run(program, range, [&](const double* work, int first, int count) {
+        for (int i = 0; i < numParticles; i++) {
+            const double *x = program.getOutput(work, 3 * i), *y = program.getOutput(work, 3 * i + 1),
+                         *z = program.getOutput(work, 3 * i + 2);
+            for (int n = 0; n < count; n++)
+                jacobian[firstEntries[first + n] + i] =
+                    isMoving[(size_t) (first + n) * numParticles + i] ? Vec3(x[n], y[n], z[n]) : Vec3();
+        }
+    });
+}
+
+void ExpressionGroup::evaluate(const vector<Vec3>& q, vector<double>& g, int first, int end) {
+    runValues(require(valueProgram, [&] { return vector<int>{value}; }), {q, nullptr, first, end}, g);
+}
+
+void ExpressionGroup::evaluateJacobian(const vector<Vec3>& q, vector<Vec3>& jacobian, int first, int end) {
+    runRows(require(jacobianProgram, [&] { return graph.findGradient(value, coordinates); }), {q, nullptr, first, end},
+            jacobian);
+}
+
+void ExpressionGroup::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result, int first,
+                                        int end) {
+    runValues(require(curvatureProgram, [&] { return vector<int>{curvature}; }), {q, &v, first, end}, result);
+}
+
+void ExpressionGroup::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, vector<Vec3>& jacobian,
+                                               int first, int end) {
+    runRows(require(velocityJacobianProgram, [&] { return graph.findGradient(rate, coordinates); }),
+            {q, &v, first, end}, jacobian);
+}

@@ -1,0 +1,56 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "step/StepDensity.h"
+#include <algorithm>
+#include <cmath>
+
+using namespace OpenMMVRattle;
+
+StepDensity::StepDensity() : StepDensity(SemiExplicit, 1.0, 0.0, 0.0) {
+}
+
+StepDensity::StepDensity(Update update, double nominal, double minimum, double maximum) : update(update) {
+    smallest = maximum > 0 ? nominal / maximum : 0.0;
+    lower = smallest;
+    if (update == Bounded)
+        lower = std::min(4 * smallest / 3, (1 + 2 * smallest) / 3);
+    if (minimum > 0) {
+        double upper = nominal / minimum;
+        k = (1 - lower) / (upper - 1);
+        upperSlope = upper * k;
+    }
+    else {
+        k = 0;
+        upperSlope = 1 - lower;
+    }
+}
+
+double StepDensity::limit(double u) const {
+    return (lower + upperSlope * u) / (1 + k * u);
+}
+
+double StepDensity::limitDerivative(double u) const {
+    double denominator = 1 + k * u;
+    return (upperSlope - lower * k) / (denominator * denominator);
+}
+
+// f(rho) = (rho - a) - (1 - a)^2/(rho - a) maps (a, infinity) onto the reals, with f(1) = 0.
+double StepDensity::f(double rho) const {
+    double x = rho - smallest, one = 1 - smallest;
+    return x - one * one / x;
+}
+
+// The positive root of x^2 - y x - (1-a)^2 = 0, without cancellation for y < 0.
+double StepDensity::inverseOfF(double y) const {
+    double one = 1 - smallest;
+    double root = std::sqrt(y * y + 4 * one * one);
+    double x = y > 0 ? 0.5 * (y + root) : 2 * one * one / (root - y);
+    return smallest + x;
+}
+
+double StepDensity::boundedUpdate(double u, double previous) const {
+    // A density of a sum update may lie outside the domain of f by its oscillation; 1e-3 of the distance keeps it in.
+    double margin = 1e-3 * (1 - smallest);
+    return inverseOfF(2 * f(std::max(u, smallest + margin)) - f(std::max(previous, smallest + margin)));
+}

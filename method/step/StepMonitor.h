@@ -1,0 +1,151 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_STEPMONITOR_H_
+#define OPENMMVRATTLE_STEPMONITOR_H_
+
+#include "constraints/ConstraintMatrix.h"
+#include "constraints/ConstraintSystem.h"
+#include "openmm/Vec3.h"
+#include <cmath>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The monitors U_k(q,p) of docs/method.md, section 4, their combination
+ *
+ *     u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2),
+ *
+ * and the derivative of u with respect to the velocities, at fixed positions. A monitor sees q only through the applied
+ * force F, through the multipliers Lambda(q,p) and through the energy of a force group.
+ */
+class StepMonitor {
+public:
+    enum Kind {
+        ConstraintMultipliers,
+        ConstraintForce,
+        AppliedForce,
+        ConstraintAndAppliedForce,
+        MultiplierPNorm,
+        ForcePNorm,
+        VectorField,
+        MaxForce,
+        ArcLength,
+        MaxParticleArcLength,
+        ForceGroupEnergy
+    };
+    struct Term {
+        Kind kind;
+        double weight, power;
+        double reference; // U_k,ref; 0 while it is not known
+    };
+
+    explicit StepMonitor(const ConstraintSystem& system);
+    void setTerms(const std::vector<Term>& terms, double normOrder);
+    const std::vector<Term>& getTerms() const {
+        return terms;
+    }
+    void setReference(int index, double value) {
+        terms[index].reference = value;
+    }
+    bool isEmpty() const {
+        return terms.empty();
+    }
+    /** Whether any term needs the multipliers. */
+    bool needsMultipliers() const;
+    /** Whether any term is defined by the constraints alone, and so is zero without them. */
+    bool needsConstraints() const;
+    /** Throws a StepFailure if a value is not a finite number, or negative. */
+    void requireValid(const std::vector<double>& values) const;
+    /** Whether any term changes with the velocities at fixed positions. */
+    bool dependsOnVelocities() const;
+    /** Whether any term does so other than through the multipliers. */
+    bool usesVelocities() const;
+
+    /**
+     * Take over the forces at new positions, on which the following evaluations are based.
+     *
+     * @param forces         the applied force on each particle (kJ/mol/nm)
+     * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
+     */
+    void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * The part of setForces() that concerns a block of particles (ConstraintSystem::getBlocks()), so that threads may share it; when
+     * all have been done, the rest is finishForces().
+     */
+    void sumForces(const std::vector<OpenMM::Vec3>& forces, int block);
+    void finishForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Whether the forces of the last setForces() were all finite. */
+    bool hasFiniteForces() const {
+        return std::isfinite(forceSquared);
+    }
+    /** The forces of the last setForces(). */
+    const std::vector<OpenMM::Vec3>& getForces() const {
+        return *forces;
+    }
+    /** The forces of the last setForces() now lie elsewhere. */
+    void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
+        forces = &newForces;
+    }
+    /**
+     * U_k at velocities v, for every term.
+     *
+     * @param v              the velocities (nm/ps)
+     * @param multipliers    Lambda(q,p) at these velocities
+     * @param rightSide      K Lambda = g''(v,v) + G M^-1 F
+     * @param values         U_k
+     */
+    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                  const std::vector<double>& rightSide, std::vector<double>& values);
+    /**
+     * The derivative of u along a change of the velocities, at the state of the last evaluate().
+     *
+     * @param v                 as in evaluate()
+     * @param multipliers       as in evaluate()
+     * @param rightSide         as in evaluate()
+     * @param values            what evaluate() gave
+     * @param velocityRate      the change of v
+     * @param multiplierRate    the change of Lambda that goes with it
+     */
+    double evaluateRate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                        const std::vector<double>& rightSide, const std::vector<double>& values,
+                        const std::vector<OpenMM::Vec3>& velocityRate, const std::vector<double>& multiplierRate) const;
+    /** Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls. */
+    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v,
+                      const ConstraintSystem::Jacobian& jacobian) const;
+    /** u, the combination of the values; 1 if there is no term. */
+    double combine(const std::vector<double>& values) const;
+    /**
+     * du/dv at the state of the last evaluate().
+     *
+     * @param q              the positions
+     * @param v              as in evaluate()
+     * @param multipliers    as in evaluate()
+     * @param values         what evaluate() gave
+     * @param matrix         the factorised K(q)
+     * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
+     */
+    void evaluateGradient(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
+                          const std::vector<double>& multipliers, const std::vector<double>& values,
+                          const ConstraintMatrix& matrix, std::vector<OpenMM::Vec3>& gradient);
+
+private:
+    double squareOf(const OpenMM::Vec3& force, int particle) const;
+    double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v,
+                        const std::vector<double>& multipliers) const;
+    double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
+    int findFastest(const std::vector<OpenMM::Vec3>& v) const;
+    const ConstraintSystem& system;
+    std::vector<Term> terms;
+    double normOrder;
+    const std::vector<OpenMM::Vec3>* forces;
+    double groupEnergy, appliedForceSquared, forceSquared, maxForce, forcePNorm, constraintForceSquared;
+    std::vector<double> blockSums; // of the squares of the forces
+    std::vector<double> toSolve, solved;
+    ConstraintSystem::Jacobian velocityJacobian;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_STEPMONITOR_H_

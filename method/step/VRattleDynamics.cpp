@@ -1,0 +1,525 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "step/VRattleDynamics.h"
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+// Differences of the velocities of particles that are the same but for the rounding of both.
+const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
+// A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
+const double SLIVER = 1e-6;
+
+} // namespace
+
+VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
+                                 const vector<ExpressionConstraint>& expressions) :
+        system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
+        automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
+        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor),
+        isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0), numIterations(0), numRescues(0),
+        lastError(0) {
+    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+    for (int i = 0; i < numParticles; i++)
+        if (masses[i] > 0)
+            movingParticles.push_back(i);
+    for (vector<Vec3>* vectors :
+         {&w, &qNext, &wNext, &vNext, &acceleration, &gradient, &halfStepChange, &qBack, &wBack, &vBack, &forceBack})
+        vectors->resize(numParticles);
+    for (vector<double>* numbers :
+         {&lambda, &rightSide, &multiplierOffset, &appliedTerm, &lambdaNext, &rightSideNext, &appliedTermNext,
+          &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction,
+          &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
+        numbers->resize(numConstraints);
+    isPieceEliminated.resize(system.getPieces().size());
+    for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
+        rows->resize(system.getNumEntries());
+}
+
+void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
+    work.setParallel(newParallel, numThreads);
+}
+
+void VRattleDynamics::setSettings(const Settings& newSettings) {
+    const bool sameControl = takeAutomaticReferences(newSettings) && newSettings.isAutomatic == settings.isAutomatic;
+    bool sameTerms = newSettings.terms.size() == settings.terms.size() && newSettings.normOrder == settings.normOrder &&
+                     newSettings.isFixedStep == settings.isFixedStep;
+    bool retakeReference = false;
+    vector<StepMonitor::Term> terms = newSettings.terms;
+    for (size_t i = 0; i < terms.size() && sameTerms; i++) {
+        const StepMonitor::Term& old = settings.terms[i];
+        sameTerms = terms[i].kind == old.kind && terms[i].weight == old.weight && terms[i].power == old.power;
+        if (terms[i].reference == 0 && old.reference == 0)
+            terms[i].reference = monitor.getTerms()[i].reference; // taken at the first step, and still in force
+        else if (terms[i].reference == 0)
+            retakeReference = true;
+    }
+    if (!sameTerms)
+        terms = newSettings.terms;
+    bool sameDensity = sameTerms && sameControl && !retakeReference && newSettings.stepSize == settings.stepSize &&
+                       newSettings.minimumStep == settings.minimumStep &&
+                       newSettings.maximumStep == settings.maximumStep && newSettings.update == settings.update;
+    for (size_t i = 0; i < terms.size() && sameDensity; i++)
+        sameDensity = terms[i].reference == monitor.getTerms()[i].reference;
+    settings = newSettings;
+    monitor.setTerms(terms, settings.normOrder);
+    requireConstraintsForMonitors();
+    density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
+    if (q.empty() || sameDensity)
+        return;
+    monitor.setForces(force, groupEnergy);
+    monitor.evaluate(v, lambda, rightSide, values);
+    rate = 0; // only the speed of convergence of the next step depends on it
+    if (settings.isAutomatic && !sameControl)
+        automatic.begin(v, force, lambda, rightSide);
+    if (!sameTerms || !sameControl || retakeReference)
+        forgetDensity();
+    else
+        rescaleDensity(u);
+    if (hasDensity)
+        formHalfStepVelocities();
+}
+
+// Returns whether automatic step control has the references that it had.
+bool VRattleDynamics::takeAutomaticReferences(const Settings& newSettings) {
+    bool areSame = true;
+    for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++) {
+        const double given = newSettings.automaticReferences[k], old = automatic.getReference(k);
+        const bool isKept = newSettings.isAutomatic && settings.isAutomatic && settings.automaticReferences[k] == 0 &&
+                            newSettings.automaticRequest == settings.automaticRequest;
+        const double reference = given == 0 && isKept ? old : given;
+        areSame = areSame && reference == old;
+        automatic.setReference(k, reference);
+    }
+    return areSame;
+}
+
+void VRattleDynamics::setReferences(const vector<double>& references) {
+    for (size_t k = 0; k < references.size(); k++)
+        if (settings.isAutomatic)
+            automatic.setReference((int) k, references[k]);
+        else
+            monitor.setReference((int) k, references[k]);
+}
+
+// Whether the density is solved for together with the constraints, which takes u at half-step momenta.
+bool VRattleDynamics::needsHalfStepValue() const {
+    return settings.update == StepDensity::SemiExplicit && !settings.isFixedStep && monitor.dependsOnVelocities();
+}
+
+void VRattleDynamics::forgetDensity() {
+    hasDensity = false;
+    firstDensity = 0;
+    rho = 1;
+}
+
+// After a jump of the state: rho keeps its ratio to u, so that it starts no oscillation.
+void VRattleDynamics::rescaleDensity(double oldU) {
+    if (!hasDensity || settings.isAutomatic)
+        return;
+    u = combineAndLimit(values);
+    if (u > 0 && oldU > 0)
+        rho *= u / oldU;
+    else
+        forgetDensity();
+}
+
+double VRattleDynamics::combineAndLimit(const vector<double>& monitorValues) const {
+    return settings.isFixedStep ? 1.0 : density.limit(monitor.combine(monitorValues));
+}
+
+void VRattleDynamics::requireConstraintsForMonitors() const {
+    if (system.getNumConstraints() == 0 && monitor.needsConstraints())
+        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
+                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
+                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
+}
+
+// ------------------------------------------------------------------------------------------- between two steps
+
+void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                            double energy) {
+    q = positions;
+    v = velocities;
+    force = forces;
+    groupEnergy = energy;
+    // Particles without mass stay as they are, in whatever array is written.
+    qNext = qBack = positions;
+    w = wNext = wBack = vNext = vBack = velocities;
+    forgetDensity();
+    densityOffset = 0;
+    std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
+    evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+    isMonitorCurrent = true;
+    if (settings.isAutomatic)
+        automatic.begin(v, force, lambda, rightSide);
+}
+
+void VRattleDynamics::startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
+                                     const double (&secondBack)[AutomaticControl::NUM_MONITORS]) {
+    automatic.start(back, secondBack);
+    hasDensity = true;
+    rho = automatic.getLast();
+    formHalfStepVelocities();
+}
+
+VRattleDynamics::Memory VRattleDynamics::getMemory() const {
+    Memory memory = {hasDensity,
+                     rho,
+                     w,
+                     multiplierOffset,
+                     {},
+                     lambda,
+                     values,
+                     hasHalfStepValue,
+                     u,
+                     halfStepValue,
+                     rate,
+                     densityOffset,
+                     automatic.getMemory()};
+    const size_t numReferences = settings.isAutomatic ? AutomaticControl::NUM_MONITORS : monitor.getTerms().size();
+    for (size_t k = 0; k < numReferences; k++)
+        memory.references.push_back(getReference((int) k));
+    return memory;
+}
+
+void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                             double energy, const Memory& memory) {
+    begin(positions, velocities, forces, energy);
+    v = velocities; // begin() has projected them, which changes the last bits
+    lambda = memory.multipliers;
+    values = memory.monitorValues;
+    setReferences(memory.references);
+    if (settings.isAutomatic)
+        automatic.setMemory(memory.automatic);
+    hasDensity = memory.hasDensity;
+    rho = memory.density;
+    w = memory.halfStepVelocities;
+    multiplierOffset = memory.multiplierOffset;
+    hasHalfStepValue = memory.hasHalfStepValue;
+    u = memory.u;
+    halfStepValue = memory.halfStepValue;
+    rate = memory.rate;
+    densityOffset = memory.densityOffset;
+}
+
+void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
+                                  const vector<Vec3>& forces, double energy) {
+    const bool hadDensity = hasDensity;
+    const double oldRho = rho, oldU = u;
+    const AutomaticControl::Memory oldControl = automatic.getMemory();
+    begin(positions, velocities, forces, energy);
+    if (!hadDensity)
+        return;
+    hasDensity = true;
+    rho = oldRho;
+    rescaleDensity(oldU);
+    if (settings.isAutomatic) {
+        automatic.setMemory(oldControl);
+        automatic.change(v, force, lambda, rightSide, 1.0);
+        rho = automatic.getLast();
+    }
+    if (hasDensity)
+        formHalfStepVelocities();
+}
+
+bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
+    if (!system.isTranslationInvariant() || movingParticles.empty())
+        return false;
+    const Vec3 shift = velocities[movingParticles[0]] - v[movingParticles[0]];
+    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
+    const double reference = sizeOf(shift) + sizeOf(v[movingParticles[0]]);
+    for (int i : movingParticles)
+        if (!(sizeOf(velocities[i] - v[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(v[i]))))
+            return false;
+    for (int i : movingParticles) {
+        v[i] = velocities[i];
+        w[i] += shift;
+    }
+    if (monitor.usesVelocities()) {
+        monitor.evaluate(v, lambda, rightSide, values);
+        hasHalfStepValue = false;
+        rescaleDensity(u);
+    }
+    if (settings.isAutomatic)
+        automatic.change(v, force, lambda, rightSide, 0.0);
+    return true;
+}
+
+void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
+    vector<Vec3>& change = vNext;
+    for (int i : movingParticles)
+        change[i] = velocities[i] - v[i];
+    projectVelocities(change);
+    double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
+    for (int i : movingParticles) {
+        changeSquared += system.getMasses()[i] * change[i].dot(change[i]);
+        v[i] += change[i];
+        speedSquared += system.getMasses()[i] * v[i].dot(v[i]);
+        w[i] += change[i];
+    }
+    evaluateU(v);
+    lambda = multiplierTrial;
+    rightSide = rightSideTrial;
+    values = valuesTrial;
+    hasHalfStepValue = false;
+    rescaleDensity(u);
+    // The density of the last step stays, for its kick is in w.
+    if (settings.isAutomatic)
+        automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
+}
+
+// p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
+void VRattleDynamics::formHalfStepVelocities() {
+    ensureFactor(FullFactor);
+    const double kick = 0.5 * settings.stepSize / rho;
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    for (int i : movingParticles)
+        w[i] = v[i] - force[i] * (kick * inverseMasses[i]);
+    system.addTransposedOverMass(jacobian, lambda, kick, w);
+    hasHalfStepValue = false;
+}
+
+// ------------------------------------------------------------------------------------------------------- the steps
+
+double VRattleDynamics::step(double maxStep) {
+    work.beginStep();
+    double full;
+    if (hasDensity) {
+        stepKind = Regular;
+        full = solveRegular();
+    }
+    else {
+        if (settings.isAutomatic && !settings.isFixedStep)
+            throw StepFailure("the automatic step control has not been started");
+        stepKind = First;
+        rhoNext = 1;
+        const vector<StepMonitor::Term>& terms = monitor.getTerms();
+        bool hasReferences =
+            std::all_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return term.reference > 0; });
+        if (firstDensity > 0)
+            rhoNext = firstDensity;
+        else if (hasReferences)
+            rhoNext = combineAndLimit(values);
+        full = settings.stepSize / rhoNext;
+        if (!std::isfinite(full))
+            throw StepFailure("the monitor is zero and there is no maximum step size; set one");
+    }
+    const bool isShortened = full > maxStep || std::fabs(full - maxStep) <= SLIVER * full;
+    stepNext = isShortened ? maxStep : full;
+    if (stepKind == First || isShortened) {
+        // A step of plain RATTLE from the on-step state.
+        if (isShortened)
+            stepKind = Shortened;
+        if (!solvePositions({v, 0.5 * stepNext, stepNext}, true))
+            throwNotConverged();
+    }
+    if (isShortened && hasDensity) // where the density would be at the end of the shortened step
+        rhoNext = rho + (rhoNext - rho) * std::min(1.0, stepNext / full);
+    kickNext = 0.5 * stepNext;
+    return stepNext;
+}
+
+bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
+    const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
+    vector<double> backValues, startValues;
+    bool hasBack = false;
+    if (isStart) {
+        hasBack = evaluateBackwards(forces, energy, backValues);
+        startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
+    }
+    const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
+    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
+                   withHalfStep);
+    if (isStart && !startDensityFrom(startValues, backValues, hasBack))
+        return false;
+    if (settings.isAutomatic)
+        automatic.measure(vNext, forces, lambdaOnStep, rightSideNext, wNext, stepNext, force);
+    // From here on nothing fails.
+    work.endStep();
+    if (settings.isAutomatic)
+        acceptAutomatic();
+    if (stepKind == Regular)
+        keepOffsets();
+    hasHalfStepValue = withHalfStep;
+    if (withHalfStep) {
+        halfStepValue = combineAndLimit(valuesHalf);
+        rate = evaluateRate();
+    }
+
+    q.swap(qNext);
+    v.swap(vNext);
+    w.swap(wNext);
+    force.swap(forces);
+    groupEnergy = energy;
+    lambda.swap(lambdaOnStep);
+    rightSide.swap(rightSideNext);
+    values.swap(valuesNext);
+    jacobian.swap(jacobianNext);
+    appliedTerm.swap(appliedTermNext);
+    factorScope = GeneralFactor;
+    monitor.forcesMoved(force);
+    isMonitorCurrent = true;
+    if (stepKind == First) {
+        hasDensity = true;
+        firstDensity = 0;
+    }
+    if (hasDensity) {
+        rho = rhoNext;
+        u = combineAndLimit(values);
+    }
+    if (hasDensity && stepKind == Shortened)
+        formHalfStepVelocities();
+    return true;
+}
+
+void VRattleDynamics::acceptAutomatic() {
+    if (settings.isFixedStep || !hasDensity)
+        automatic.acceptMeasured();
+    else if (stepKind == Regular)
+        automatic.acceptStep();
+    else {
+        automatic.acceptPartOfStep(std::min(1.0, stepNext * automatic.getNext() / settings.stepSize));
+        rhoNext = automatic.getLast();
+    }
+}
+
+void VRattleDynamics::reverse() {
+    if (hasDensity) {
+        const long long rescuesBefore = numRescues;
+        solveRegular();
+        keepOffsets();
+        numRescues = rescuesBefore;
+        for (int i : movingParticles)
+            w[i] = -wNext[i];
+        rho = rhoNext;
+        automatic.reverse();
+        rate = -rate;
+        hasHalfStepValue = false;
+    }
+    for (int i : movingParticles)
+        v[i] = -v[i];
+}
+
+// ------------------------------------------------------------------------------------------------------- the start
+
+/*
+ * The recursion of the density keeps an oscillation of rho about u for ever, so it must start without one. The smooth
+ * solution is rho[1/2] = u0 + (u1 - u-1)/4 + O(h^3), u0 being u(q0,p0), or for (3.14) the mean of u(q0,p1/2) and
+ * u(q0,p-1/2); which follows from docs/method.md, section 7. The first step is a step of
+ * plain RATTLE from the on-step state, which gives u1 with the one force evaluation that the step costs anyway; u-1
+ * comes from a step backwards, whose forces are extrapolated along the path from those at q0 and q1, exactly so where
+ * the motion starts at rest (and then q-1 = q1) or the forces are constant.
+ *
+ * Where no reference value is given, rho[1/2] = 1 and it is the reference value that is chosen such that this is the
+ * smooth start: no force evaluation is spent on it. Where one is given, rho[1/2] follows, and the first step is taken
+ * again with it.
+ */
+bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energy, vector<double>& backValues) {
+    qNext.swap(qBack);
+    wNext.swap(wBack);
+    bool isSolved = solvePositions({v, -0.5 * stepNext, -stepNext}, true);
+    qNext.swap(qBack);
+    wNext.swap(wBack);
+    if (!isSolved)
+        return false;
+    double product = 0, square = 0;
+    for (int i = 0; i < system.getNumParticles(); i++) {
+        Vec3 forward = qNext[i] - q[i];
+        product += system.getMasses()[i] * forward.dot(qBack[i] - q[i]);
+        square += system.getMasses()[i] * forward.dot(forward);
+    }
+    const double alpha = square > 0 ? product / square : 0.0;
+    for (int i = 0; i < system.getNumParticles(); i++)
+        forceBack[i] = force[i] + (forces[i] - force[i]) * alpha;
+    try {
+        evaluateOnStep(qBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext, vBack,
+                       lambdaBack, rightSideBack, backValues, false);
+    }
+    catch (const StepFailure&) {
+        return false; // no state to look back at
+    }
+    return true;
+}
+
+// The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
+vector<double> VRattleDynamics::evaluateHalfSteps() {
+    evaluateU(wNext);
+    vector<double> result = valuesTrial;
+    evaluateU(wBack);
+    for (size_t k = 0; k < result.size(); k++)
+        result[k] = 0.5 * (result[k] + valuesTrial[k]);
+    return result;
+}
+
+// Returns whether the first step stands; if not, firstDensity says with which density to take it again.
+bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const vector<double>& backValues,
+                                       bool hasBack) {
+    const vector<StepMonitor::Term>& terms = monitor.getTerms();
+    bool areAllTaken = true;
+    for (size_t k = 0; k < terms.size(); k++) {
+        if (terms[k].reference > 0)
+            areAllTaken = false;
+        else if (monitor.isNegligible((int) k, values[k], v, jacobian))
+            throw StepFailure(
+                "monitor " + std::to_string(k) +
+                " is zero at the first step, which is then no measure for later ones; call calibrate() or "
+                "setReferenceMonitorValue()");
+    }
+    for (size_t k = 0; k < terms.size(); k++)
+        if (terms[k].reference == 0)
+            monitor.setReference((int) k,
+                                 startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
+    if (areAllTaken) {
+        if (hasBack)
+            scaleReferences(startValues, backValues);
+        return true;
+    }
+    if (firstDensity > 0)
+        return true;
+    const double back = hasBack ? combineAndLimit(backValues) : 0.0;
+    firstDensity = startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
+    return std::fabs(firstDensity - rhoNext) <= 1e-12 * rhoNext;
+}
+
+// With rho[1/2] = 1 the steps to either side have the size h, and not h/u0, so that the change of u over a step of the
+// sequence is theirs over u0. Scale the references such that u0 + (u1 - u-1)/(4 u0) = 1.
+void VRattleDynamics::scaleReferences(const vector<double>& startValues, const vector<double>& backValues) {
+    vector<double> references;
+    for (const StepMonitor::Term& term : monitor.getTerms())
+        references.push_back(term.reference);
+    auto mismatchOf = [&](double scale) {
+        for (size_t k = 0; k < references.size(); k++)
+            monitor.setReference((int) k, scale * references[k]);
+        const double start = combineAndLimit(startValues);
+        return start + 0.25 * (combineAndLimit(valuesNext) - combineAndLimit(backValues)) / start - 1;
+    };
+    double last = 1, scale = 1.001, lastMismatch = mismatchOf(last);
+    for (int iteration = 0; iteration < 20; iteration++) { // the secant method
+        const double mismatch = mismatchOf(scale);
+        const double next = scale - mismatch * (scale - last) / (mismatch - lastMismatch);
+        if (std::fabs(mismatch) < 1e-14 || !(next > 0.5 && next < 2))
+            break;
+        last = scale;
+        lastMismatch = mismatch;
+        scale = next;
+    }
+    // Where the monitor is not resolved the scale is left alone.
+    if (!(std::fabs(mismatchOf(scale)) < 1e-6))
+        mismatchOf(1);
+}
+
+// The smooth sequence's value half a step after the start, from the values at the start, one step ahead and one back.
+double VRattleDynamics::startValue(double start, double ahead, const double* back) {
+    const double value = back != nullptr ? start + 0.25 * (ahead - *back) : 0.5 * (start + ahead);
+    // What changes by its own size within the first step is not resolved: take it as it is.
+    return value > 0.5 * start && value < 2 * start ? value : start;
+}

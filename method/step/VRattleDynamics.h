@@ -1,0 +1,324 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_VRATTLEDYNAMICS_H_
+#define OPENMMVRATTLE_VRATTLEDYNAMICS_H_
+
+#include "constraints/ClusterBatch.h"
+#include "constraints/ConstraintMatrix.h"
+#include "constraints/ConstraintSystem.h"
+#include "constraints/NewtonMatrix.h"
+#include "constraints/SharedWork.h"
+#include "constraints/StepFailure.h"
+#include "openmm/Vec3.h"
+#include "step/AutomaticControl.h"
+#include "step/StepDensity.h"
+#include "step/StepMonitor.h"
+#include <functional>
+#include <limits>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The method VRATTLE, equations (3.9)-(3.14) of Barth, Leimkuhler and Reich, for a system of particles whose forces
+ * somebody else computes. It knows no Context, no Kernel and no Platform.
+ *
+ * A step is made in two halves, around the one evaluation of the forces that it costs:
+ *
+ *     dynamics.step(maxStep);                  // (3.9)-(3.11), (3.14): new positions, getNextPositions()
+ *     ... compute the forces there ...
+ *     dynamics.finish(forces, groupEnergy);    // (3.12)-(3.13): new on-step velocities; the step is complete
+ *
+ * Until finish() has returned, the state before the step is untouched. Momenta are kept as velocities: v stands for
+ * M^-1 p[n], w for M^-1 p[n-1/2].
+ */
+class VRattleDynamics {
+public:
+    /** What a user can choose. */
+    struct Settings {
+        double stepSize;                      // the nominal step h (ps)
+        double minimumStep, maximumStep;      // bounds (ps), 0 for none
+        double tolerance;                     // of the constraints, relative
+        StepDensity::Update update;
+        std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
+        double normOrder;
+        bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
+        // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
+        bool isAutomatic = false;
+        double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
+        int automaticRequest = 0; // changes when references in force are to be forgotten
+    };
+
+    /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
+    struct Memory {
+        bool hasDensity;
+        double density; // rho[n-1/2]
+        std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
+        std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1], in internal order
+        std::vector<double> references; // U_k,ref in force
+        // What could be computed again but for the last bits, which decide whether a restart is exact:
+        std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
+        bool hasHalfStepValue;
+        double u, halfStepValue; // u(q[n],p[n]), u(q[n],p[n-1/2])
+        double rate; // the change of u along F - G^T Lambda
+        double densityOffset; // what (3.14) and (3.15) differed by in the last step
+        AutomaticControl::Memory automatic; // of automatic step control
+    };
+
+    VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                    const std::vector<ExpressionConstraint>& expressions = {});
+
+    typedef SharedWork::Parallel Parallel;
+    /**
+     * Let threads share the clusters, and the pieces of large ones, where that is faster. Results do not depend on the number of
+     * threads, to the last bit.
+     */
+    void setParallel(const Parallel& parallel, int numThreads);
+
+    /**
+     * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
+     * half-step momentum is formed anew.
+     *
+     * @throws StepFailure    if a monitor needs constraints and there are none
+     */
+    void setSettings(const Settings& settings);
+
+    /**
+     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
+     * those that do so to the tolerance are left as they are.
+     *
+     * @return whether the positions were changed
+     * @throws StepFailure    if there is no such configuration nearby
+     */
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
+    /** Start afresh at a state. The velocities are projected onto the constraints. */
+    void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    Memory getMemory() const;
+    /** Change the parameters of an expression, before the next begin(). */
+    void setParameters(int expression, const std::map<std::string, double>& parameters) {
+        system.setParameters(expression, parameters);
+    }
+    /**
+     * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
+     * following steps are the same to the last bit if the forces are.
+     */
+    void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
+    /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
+    void setReferences(const std::vector<double>& references);
+    /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
+    void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * Go on with velocities that are the present ones seen from a uniformly moving frame, as a remover of the motion of the
+     * centre of mass leaves them in each step. Constraints between moving particles and their multipliers know nothing of it, so
+     * that it costs no more than to look.
+     *
+     * @return whether that is what they are; if not, nothing has been changed
+     */
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
+    /** Go on with changed velocities at the same positions; as changeState(). */
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
+
+    /**
+     * The first half of a step.
+     *
+     * @param maxStep    the step must not be longer than this (ps); a shortened step goes on with the same density
+     * @return the size of the step (ps)
+     * @throws StepFailure    if the equations of the step have no solution that the iteration finds
+     */
+    double step(double maxStep);
+    /**
+     * The second half of a step.
+     *
+     * @param[in,out] forces    the applied forces at getNextPositions(); if the step is complete their storage is taken
+     *                          over, and that of the forces before is left in its place
+     * @param groupEnergy       the energy of the monitor's force group there
+     * @return whether the step is complete. If not, the state is as before step(), the density of the first step is now known
+     *         better, and both halves are to be done again. This happens once, at a start with given reference values.
+     * @throws StepFailure    if the forces are not finite or the constraints have become dependent
+     */
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Whether the next step continues a sequence of densities; if not, it is the first one. */
+    bool hasStarted() const {
+        return hasDensity;
+    }
+    /** The state and the references of automatic step control. */
+    const AutomaticControl& getAutomaticControl() const {
+        return automatic;
+    }
+    /** Start the densities of automatic step control; see AutomaticControl::start(). The references must be known. */
+    void startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
+                        const double (&secondBack)[AutomaticControl::NUM_MONITORS]);
+    /** Turn time around, without a force. */
+    void reverse();
+
+    const ConstraintSystem& getConstraintSystem() const {
+        return system;
+    }
+    /** q[n]. */
+    const std::vector<OpenMM::Vec3>& getPositions() const {
+        return q;
+    }
+    /** q[n+1], after step(). */
+    const std::vector<OpenMM::Vec3>& getNextPositions() const {
+        return qNext;
+    }
+    /** M^-1 p[n]. */
+    const std::vector<OpenMM::Vec3>& getVelocities() const {
+        return v;
+    }
+    /** F(q[n]). */
+    const std::vector<OpenMM::Vec3>& getForces() const {
+        return force;
+    }
+    /** The energy of the monitor's force group at q[n]. */
+    double getGroupEnergy() const {
+        return groupEnergy;
+    }
+    /** rho[n-1/2]. */
+    double getDensity() const {
+        return rho;
+    }
+    /** U_k(q[n],p[n]). */
+    const std::vector<double>& getMonitorValues() const {
+        return values;
+    }
+    /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
+    double getReference(int index) const {
+        return settings.isAutomatic ? automatic.getReference(index) : monitor.getTerms()[index].reference;
+    }
+    /** Lambda(q[n],p[n]) for the constraints as ConstraintSystem writes them, in internal order. */
+    const std::vector<double>& getMultipliers() const {
+        return lambda;
+    }
+    long long getNumIterations() const {
+        return numIterations;
+    }
+    long long getNumRescues() const {
+        return numRescues;
+    }
+
+private:
+    enum StepKind { Regular, First, Shortened };
+    enum SolveResult { Converged, TooSlow, NotConverged, NotPositive };
+    enum FactorScope { NoFactor, GeneralFactor, FullFactor };
+    void requireConstraintsForMonitors() const;
+    bool takeAutomaticReferences(const Settings& newSettings);
+    void acceptAutomatic();
+    void forgetDensity();
+    void rescaleDensity(double oldU);
+    double combineAndLimit(const std::vector<double>& monitorValues) const;
+    bool needsHalfStepValue() const;
+
+    void ensureFactor(FactorScope scope);
+    void formHalfStepVelocities();
+    double evaluateU(const std::vector<OpenMM::Vec3>& velocities);
+    void projectVelocities(std::vector<OpenMM::Vec3>& velocities);
+    void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
+                        const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
+                        std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
+                        std::vector<double>& rightSides, std::vector<double>& monitorValues, bool withHalfStep);
+    /** The on-step state that is computed, and what from. */
+    struct OnStep {
+        const std::vector<OpenMM::Vec3>&positions, &halfStep, &forces;
+        std::vector<OpenMM::Vec3>& velocities;
+        std::vector<double>&multipliers, &rightSides;
+        double kick;
+        bool withHalfStep;
+    };
+    int evaluateOnStepGeneral(const OnStep& state, const ConstraintSystem::Part& part);
+    int evaluateOnStepPieces(const OnStep& state);
+    int beginVelocities(const OnStep& state, const ConstraintSystem::Part& part);
+    void beginMultipliers(const OnStep& state, const ConstraintSystem::Part& part);
+    void formMultiplierEquations(const OnStep& state, const ConstraintSystem::Part& part);
+    void beginRates(const OnStep& state, const ConstraintSystem::Part& part);
+    void formRateEquations(const OnStep& state, const ConstraintSystem::Part& part);
+    double evaluateRate();
+
+    /** A step from q: half-step velocities start + kick acceleration, positions q + drift of these. */
+    struct Trial {
+        const std::vector<OpenMM::Vec3>& start;
+        double kick, drift;
+    };
+    StepArrays stepArrays(const Trial& trial);
+    void startMultipliers(bool withOffset, int first, int end);
+    void startMultipliers(bool withOffset);
+    void computeTrial(const Trial& trial, const int* firstParticle, const int* endParticle,
+                      const ConstraintSystem::Part& part, bool withVelocities);
+    void computeTrial(const Trial& trial);
+    void computeTrial(const Trial& trial, const ConstraintSystem::Part& part, bool withVelocities);
+    void moveFreeParticle(int i, const Trial& trial);
+    bool solvePositions(const Trial& trial, bool isFromOnStep);
+    static bool isLastIteration(int iteration, double error, double previous, double tolerance);
+    double solveGeneral(const ConstraintSystem::Part& part, const Trial& trial, double tolerance, int& iterations);
+    void updateMultipliers(const Trial& trial, int first, int end);
+    double evaluatePiece(const ConstraintSystem::Part& piece, const Trial& trial, double tolerance, bool isFirst);
+    double solvePieces(const Trial& trial, double error, double tolerance, int& iterations);
+    bool solvePositionsByNewton(const Trial& trial);
+    bool iterateNewton(const Trial& trial);
+    SolveResult solveCoupled();
+    double beginCoupledPass(const ConstraintSystem::Part& part, const Trial& trial);
+    double formCoupledEquations(const ConstraintSystem::Part& part, const Trial& trial);
+    double coupledPassGeneral(const ConstraintSystem::Part& part, const Trial& trial);
+    double finishCoupledPassOfPieces(const Trial& trial);
+    SolveResult solveCoupledByNewton();
+    double solveRegular();
+    void keepOffsets();
+    [[noreturn]] void throwNotConverged() const;
+
+    bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
+    std::vector<double> evaluateHalfSteps();
+    bool startDensityFrom(const std::vector<double>& startValues, const std::vector<double>& backValues, bool hasBack);
+    void scaleReferences(const std::vector<double>& startValues, const std::vector<double>& backValues);
+    static double startValue(double start, double ahead, const double* back);
+
+    ConstraintSystem system;
+    ConstraintMatrix matrix;
+    NewtonMatrix newtonMatrix;
+    StepMonitor monitor;
+    StepDensity density;
+    AutomaticControl automatic;
+    SharedWork work;
+    Settings settings;
+    std::vector<int> movingParticles;
+
+    // The state between two steps.
+    std::vector<OpenMM::Vec3> q, v, w, force;
+    double groupEnergy, rho, u;
+    std::vector<double> lambda, rightSide, values; // Lambda, K Lambda and U_k
+    std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1]
+    bool hasDensity, hasHalfStepValue;
+    double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
+    double densityOffset; // what (3.14) and (3.15) differed by in the last step
+    double firstDensity; // of the first step, once it is known; else 0
+
+    // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
+    FactorScope factorScope;
+    bool isMonitorCurrent; // whether the monitor has the forces at q[n]
+    ConstraintSystem::Jacobian jacobian;
+    std::vector<double> appliedTerm;
+
+    // The step in progress.
+    StepKind stepKind;
+    std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
+    double rhoNext, stepNext, kickNext;
+    std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext, appliedTermNext;
+    std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
+    std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
+    ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
+    std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the correction of a piece
+
+    // Work space of the start.
+    std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
+    std::vector<double> lambdaBack, rightSideBack;
+
+    long long numIterations, numRescues;
+    double lastError; // the largest relative error of a constraint that the last iteration left
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_VRATTLEDYNAMICS_H_

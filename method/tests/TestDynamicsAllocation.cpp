@@ -1,0 +1,126 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Once a run is going, a step allocates no memory.
+
+#include "TestSupport.h"
+#include "step/VRattleDynamics.h"
+#include <atomic>
+#include <cmath>
+#include <cstdlib>
+#include <new>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+static std::atomic<long long> numAllocations(0);
+
+#ifndef __SANITIZE_ADDRESS__ // which has an operator of its own
+void* operator new(std::size_t size) {
+    numAllocations++;
+    void* memory = std::malloc(size);
+    if (memory == nullptr)
+        throw std::bad_alloc();
+    return memory;
+}
+
+void operator delete(void* memory) noexcept {
+    std::free(memory);
+}
+
+void operator delete(void* memory, std::size_t) noexcept {
+    std::free(memory);
+}
+#endif
+
+struct Example {
+    vector<double> masses;
+    vector<DistanceConstraint> distances;
+    vector<ExpressionConstraint> expressions;
+    vector<Vec3> positions, velocities;
+
+    int add(double mass, const Vec3& position) {
+        const int i = (int) masses.size();
+        masses.push_back(mass);
+        positions.push_back(position);
+        velocities.push_back(Vec3(0.1 * std::sin(3 * i), 0.1 * std::sin(5 * i), 0.1 * std::sin(7 * i)));
+        return i;
+    }
+    void join(int i, int j) {
+        const Vec3 r = positions[i] - positions[j];
+        distances.push_back({i, j, std::sqrt(r.dot(r))});
+    }
+};
+
+// Waters, zigzag chains of which one is cut into pieces, angles held by expressions, and free particles.
+static Example makeExample() {
+    Example e;
+    for (int bonds : {20000, 300, 10, 10}) {
+        const double height = (double) e.masses.size();
+        int last = e.add(14, Vec3(0, height, 0));
+        for (int i = 1; i <= bonds; i++) {
+            const int next = e.add(14, Vec3(0.12 * i, height + 0.05 * (i % 2), 0));
+            e.join(last, next);
+            last = next;
+        }
+    }
+    for (int n = 0; n < 200; n++) {
+        const Vec3 place(n, -5, 0);
+        const int oxygen = e.add(16, place), one = e.add(1, place + Vec3(0.08, 0.06, 0)),
+                  other = e.add(1, place + Vec3(-0.08, 0.06, 0));
+        e.join(oxygen, one);
+        e.join(oxygen, other);
+        e.join(one, other);
+        const Vec3 corner(n, -10, 0);
+        const int a = e.add(12, corner + Vec3(0.1, 0, 0)), b = e.add(12, corner),
+                  c = e.add(12, corner + Vec3(0, 0.1, 0));
+        e.expressions.push_back({"(x1-x2)*(x3-x2)+(y1-y2)*(y3-y2)+(z1-z2)*(z3-z2)", {a, b, c}, {}});
+        e.add(40, Vec3(n, -20, 0));
+    }
+    return e;
+}
+
+void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int numThreads) {
+    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
+    int calls = 0;
+    dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
+    dynamics.setSettings(settings);
+    vector<Vec3> forces(e.masses.size());
+    dynamics.begin(e.positions, e.velocities, forces, 0);
+    if (settings.isAutomatic)
+        dynamics.startAutomatic({1.1e4, 1.1e4}, {1e4, 1e4});
+    auto takeSteps = [&](int count) {
+        for (int i = 0; i < count; i++)
+            do
+                dynamics.step(INFINITY);
+            while (!dynamics.finish(forces, 0));
+    };
+    takeSteps(2); // what the first steps need is kept
+    const long long before = numAllocations;
+    takeSteps(20);
+    ASSERT_EQUAL(before, (long long) numAllocations);
+    ASSERT((calls > 0) == (numThreads > 1));
+}
+
+int main() {
+    const Example e = makeExample();
+    auto make = [](StepDensity::Update update) {
+        return VRattleDynamics::Settings{
+            0.001, 0.001 / 50, 0.002, 1e-8, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
+    };
+    const VRattleDynamics::Settings automatic = {0.001, 0,    0,          1e-8, StepDensity::SemiExplicit, {}, 8,
+                                                 false, true, {1e4, 1e4}, 0};
+    TestList tests;
+    for (int numThreads : {1, 2}) {
+        const std::string threads = std::to_string(numThreads) + (numThreads == 1 ? " thread" : " threads");
+        tests.push_back({"SemiExplicit, " + threads,
+                         [&, numThreads] { testSteps(e, make(StepDensity::SemiExplicit), numThreads); }});
+        tests.push_back(
+            {"Explicit, " + threads, [&, numThreads] { testSteps(e, make(StepDensity::Explicit), numThreads); }});
+        tests.push_back(
+            {"automatic step control, " + threads, [&, numThreads] { testSteps(e, automatic, numThreads); }});
+    }
+    return runTests(tests);
+}

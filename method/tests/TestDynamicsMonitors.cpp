@@ -1,0 +1,224 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// StepMonitor: every du/dv against central differences. StepDensity: the recursions and the bounds.
+
+#include "TestSupport.h"
+#include "step/StepDensity.h"
+#include "step/StepMonitor.h"
+#include <cmath>
+#include <random>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+// A zigzag chain of five particles with a branch, forces and velocities at random.
+struct Example {
+    Example() : masses({12, 1, 16, 14, 1, 32}), positions(6), velocities(6), forces(6) {
+        std::mt19937 random(3);
+        std::normal_distribution<double> normal;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 3; j++) {
+                positions[i][j] = 0.1 * i * (j == 0) + 0.05 * normal(random);
+                velocities[i][j] = normal(random);
+                forces[i][j] = 3 * normal(random); // comparable to the momenta, or differences drown in rounding
+            }
+        for (auto pair : {std::make_pair(0, 1), {1, 2}, {2, 3}, {3, 4}, {2, 5}}) {
+            Vec3 r = positions[pair.first] - positions[pair.second];
+            constraints.push_back({pair.first, pair.second, std::sqrt(r.dot(r))});
+        }
+    }
+    vector<double> masses;
+    vector<DistanceConstraint> constraints;
+    vector<ExpressionConstraint> expressions;
+    vector<Vec3> positions, velocities, forces;
+};
+
+// u(q,v) as a function of the velocities alone, from the pieces that the dynamics uses.
+class Evaluation {
+public:
+    Evaluation(const Example& e, const vector<StepMonitor::Term>& terms, double order) :
+            e(e), system(e.masses, e.constraints, e.expressions), matrix(system), monitor(system),
+            jacobian(system.getNumEntries()), applied(system.getNumConstraints()),
+            multipliers(system.getNumConstraints()) {
+        system.evaluateJacobian(e.positions, jacobian);
+        matrix.factorize(jacobian);
+        system.multiplyOverMass(jacobian, e.forces, applied);
+        monitor.setTerms(terms, order);
+        monitor.setForces(e.forces, 4.2);
+    }
+    double u(const vector<Vec3>& v) {
+        system.evaluateCurvature(e.positions, v, multipliers);
+        for (size_t k = 0; k < multipliers.size(); k++)
+            multipliers[k] += applied[k];
+        rightSide = multipliers;
+        matrix.solve(multipliers);
+        monitor.evaluate(v, multipliers, rightSide, values);
+        return monitor.combine(values);
+    }
+    // du along a change of v, with the change of Lambda that goes with it: 2 K^-1 G(v) dv
+    double rate(const vector<Vec3>& v, const vector<Vec3>& change) {
+        u(v);
+        vector<double> multiplierRate(multipliers.size());
+        ConstraintSystem::Jacobian velocityJacobian(system.getNumEntries());
+        system.evaluateVelocityJacobian(e.positions, v, velocityJacobian);
+        system.multiply(velocityJacobian, change, multiplierRate);
+        for (double& x : multiplierRate)
+            x *= 2;
+        matrix.solve(multiplierRate);
+        return monitor.evaluateRate(v, multipliers, rightSide, values, change, multiplierRate);
+    }
+    vector<Vec3> gradient(const vector<Vec3>& v) {
+        u(v);
+        vector<Vec3> result(v.size());
+        monitor.evaluateGradient(e.positions, v, multipliers, values, matrix, result);
+        return result;
+    }
+    const Example& e;
+    ConstraintSystem system;
+    ConstraintMatrix matrix;
+    StepMonitor monitor;
+    ConstraintSystem::Jacobian jacobian;
+    vector<double> applied, multipliers, rightSide, values;
+};
+
+static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
+                          const vector<ExpressionConstraint>& expressions = {}) {
+    Example e;
+    e.expressions = expressions;
+    Evaluation evaluation(e, terms, order);
+    vector<Vec3> gradient = evaluation.gradient(e.velocities);
+    double largest = 0;
+    for (const Vec3& g : gradient)
+        largest = std::max(largest, std::sqrt(g.dot(g)));
+    ASSERT((largest > 0) == evaluation.monitor.dependsOnVelocities());
+    const double h = 1e-5;
+    for (size_t i = 0; i < gradient.size(); i++)
+        for (int j = 0; j < 3; j++) {
+            vector<Vec3> plus = e.velocities, minus = e.velocities;
+            plus[i][j] += h;
+            minus[i][j] -= h;
+            double difference = (evaluation.u(plus) - evaluation.u(minus)) / (2 * h);
+            ASSERT(std::fabs(difference - gradient[i][j]) <= 1e-6 * largest);
+        }
+    // The rate along a direction is the gradient times it.
+    double expected = 0;
+    for (size_t i = 0; i < gradient.size(); i++)
+        expected += gradient[i].dot(e.forces[i]);
+    ASSERT(std::fabs(evaluation.rate(e.velocities, e.forces) - expected) <= 1e-10 * (std::fabs(expected) + largest));
+}
+
+void testGradients() {
+    for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
+        for (double power : {1.0, 0.5, 2.0})
+            checkGradient({{(StepMonitor::Kind) kind, 1.0, power, 700.0}}, 8);
+    checkGradient({{StepMonitor::MultiplierPNorm, 1.0, 1.0, 1e4}}, 3);
+}
+
+// G(v) of an expression depends on the positions, unlike that of a distance.
+void testGradientsWithExpressions() {
+    const vector<ExpressionConstraint> expressions = {{"sin(3*x1)*y2+z1*z2^2-d", {5, 0}, {{"d", 0.2}}},
+                                                      {"exp(x1)*sqrt(1+y1^2)-z1", {4}, {}}};
+    for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
+        checkGradient({{(StepMonitor::Kind) kind, 1.0, 0.5, 700.0}}, 8, expressions);
+}
+
+void testCombinationGradient() {
+    checkGradient({{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 5e4},
+                   {StepMonitor::ConstraintForce, 2.0, 0.5, 800.0},
+                   {StepMonitor::ForcePNorm, 0.3, 1.0, 200.0},
+                   {StepMonitor::VectorField, 0.7, 2.0, 900.0}},
+                  8);
+}
+
+void testCombination() {
+    // Each term is 1 at its reference, and so is the combination, whatever the weights.
+    Example e;
+    vector<StepMonitor::Term> terms = {{StepMonitor::MaxForce, 3.0, 1.0, 1.0},
+                                       {StepMonitor::VectorField, 0.5, 0.5, 1.0}};
+    Evaluation evaluation(e, terms, 8);
+    evaluation.u(e.velocities);
+    vector<double> values = evaluation.values;
+    for (int i = 0; i < 2; i++)
+        evaluation.monitor.setReference(i, values[i]);
+    ASSERT_EQUAL_TOL(1.0, evaluation.monitor.combine(values), 1e-14);
+    double expected = std::sqrt((9 * 4.0 + 0.25 * 3.0) / 9.25); // U1 doubled; U2 trebled, to the power 1/2
+    ASSERT_EQUAL_TOL(expected, evaluation.monitor.combine({2 * values[0], 3 * values[1]}), 1e-14);
+    evaluation.monitor.setTerms({}, 8);
+    ASSERT_EQUAL(1.0, evaluation.monitor.combine({}));
+}
+
+void testNegligibleMultipliers() {
+    // In free fall nothing pulls: the multipliers are rounding, and no measure.
+    Example e;
+    for (int i = 0; i < 6; i++) {
+        e.forces[i] = Vec3(0, -9.8 * e.masses[i], 0);
+        e.velocities[i] = Vec3(0.3, 0.4, 0);
+    }
+    Evaluation evaluation(
+        e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
+    evaluation.u(e.velocities);
+    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
+    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
+    e.velocities[0] = Vec3(0.3, 0.4001, 0);
+    evaluation.u(e.velocities);
+    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
+    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
+}
+
+void testBounds() {
+    const double nominal = 0.002, minimum = 1e-4, maximum = 0.005;
+    StepDensity density(StepDensity::SemiExplicit, nominal, minimum, maximum);
+    ASSERT_EQUAL_TOL(nominal / maximum, density.limit(0), 1e-14);
+    ASSERT_EQUAL_TOL(1.0, density.limit(1), 1e-14);
+    ASSERT_EQUAL_TOL(nominal / minimum, density.limit(1e15), 1e-10);
+    StepDensity unbounded(StepDensity::SemiExplicit, nominal, 0, 0);
+    ASSERT_EQUAL_TOL(37.5, unbounded.limit(37.5), 1e-14);
+    StepDensity onlyMaximum(StepDensity::SemiExplicit, nominal, 0, maximum);
+    ASSERT_EQUAL_TOL(0.4 + 0.6 * 37.5, onlyMaximum.limit(37.5), 1e-14);
+    // The update Bounded starts B a little higher, so that f(B) is finite: docs/method.md, section 3.
+    StepDensity bounded(StepDensity::Bounded, nominal, minimum, maximum);
+    ASSERT_EQUAL_TOL(std::min(4 * 0.4 / 3, (1 + 2 * 0.4) / 3), bounded.limit(0), 1e-14);
+    ASSERT_EQUAL_TOL(1.0, bounded.limit(1), 1e-14);
+    for (const StepDensity& d : {density, unbounded, onlyMaximum, bounded})
+        for (double u : {0.01, 0.5, 1.0, 3.0, 100.0}) {
+            double h = 1e-6 * u;
+            ASSERT_EQUAL_TOL((d.limit(u + h) - d.limit(u - h)) / (2 * h), d.limitDerivative(u), 1e-7);
+        }
+}
+
+void testRecursions() {
+    const double nominal = 0.002, maximum = 0.004, a = 0.5;
+    StepDensity density(StepDensity::Bounded, nominal, 0, maximum);
+    auto f = [&](double rho) { return (rho - a) - (1 - a) * (1 - a) / (rho - a); };
+    std::mt19937 random(11);
+    std::uniform_real_distribution<double> exponent(-6, 6);
+    double previous = 1;
+    for (int i = 0; i < 10000; i++) {
+        double u = density.limit(std::exp(exponent(random)));
+        double next = density.boundedUpdate(u, previous);
+        ASSERT(next > a); // every step is shorter than the maximum
+        double scale = std::fabs(f(next)) + std::fabs(f(previous)) + std::fabs(f(u));
+        ASSERT(std::fabs(f(next) + f(previous) - 2 * f(u)) <= 1e-9 * scale);
+        // symmetric: the recursion backwards gives the density it came from
+        if (next > a + 1e-3 * (1 - a) && previous > a + 1e-3 * (1 - a))
+            ASSERT_EQUAL_TOL(previous, density.boundedUpdate(u, next), 1e-6);
+        previous = next > a + 1e-2 && next < 100 ? next : 1.0;
+    }
+    ASSERT_EQUAL_TOL(0.3, StepDensity::sumUpdate(0.9, StepDensity::sumUpdate(0.9, 0.3)), 1e-14);
+    // Where the density is large the bounded update is the paper's sum, nearly.
+    ASSERT_EQUAL_TOL(StepDensity::sumUpdate(1000, 900), density.boundedUpdate(1000, 900), 1e-5);
+}
+
+int main() {
+    return runTests({
+        {"du/dv of every monitor against differences", testGradients},
+        {"du/dv with expressions among the constraints", testGradientsWithExpressions},
+        {"du/dv of a combination against differences", testCombinationGradient},
+        {"the combination is normalised term by term", testCombination},
+        {"multipliers that are rounding are noticed", testNegligibleMultipliers},
+        {"the bounds of the step", testBounds},
+        {"the recursions of the density", testRecursions},
+    });
+}

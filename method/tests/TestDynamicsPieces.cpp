@@ -1,0 +1,389 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Clusters so large that they are cut into pieces: the cut, K and the steps against Eigen's sparse factorisation of the same matrix,
+// and the same bits with any number of threads.
+
+#include "TestSupport.h"
+#include "constraints/ClusterCut.h"
+#include "step/VRattleDynamics.h"
+#include <Eigen/SparseCholesky>
+#include <Eigen/SparseCore>
+#include <cmath>
+#include <random>
+#include <set>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::string;
+using std::vector;
+
+typedef Eigen::SparseMatrix<double> SparseMatrix;
+
+struct Example {
+    vector<double> masses;
+    vector<DistanceConstraint> distances;
+    vector<ExpressionConstraint> expressions;
+    vector<Vec3> positions, velocities;
+};
+
+static std::mt19937 generator(11);
+
+static double uniform(double from, double to) {
+    return std::uniform_real_distribution<double>(from, to)(generator);
+}
+
+static Vec3 randomVector(double scale) {
+    std::normal_distribution<double> normal;
+    return Vec3(normal(generator), normal(generator), normal(generator)) * scale;
+}
+
+static int addParticle(Example& e, double mass, const Vec3& position) {
+    e.masses.push_back(mass);
+    e.positions.push_back(position);
+    e.velocities.push_back(randomVector(0.3));
+    return (int) e.masses.size() - 1;
+}
+
+static void join(Example& e, int i, int j) {
+    const Vec3 r = e.positions[i] - e.positions[j];
+    e.distances.push_back({i, j, std::sqrt(r.dot(r))});
+}
+
+// A backbone held by an anchor at one end, a side group at each third particle and a triangle at each seventh, beside some waters
+// and free particles. The constraints stand in no order.
+static Example makeComb(int backbone) {
+    Example e;
+    int last = addParticle(e, 0, Vec3());
+    e.velocities.back() = Vec3();
+    for (int i = 1; i < backbone; i++) {
+        const Vec3 place = Vec3(0.12 * i, 0.05 * (i % 2), 0) + randomVector(0.02);
+        const int next = addParticle(e, uniform(10, 40), place);
+        join(e, last, next);
+        if (i % 3 == 0)
+            join(e, next, addParticle(e, 1, place + Vec3(0, 0.1, 0.03)));
+        if (i % 7 == 0) {
+            const int a = addParticle(e, 2, place + Vec3(0.02, 0, 0.1)),
+                      b = addParticle(e, 3, place - Vec3(0.03, 0, 0.1));
+            join(e, next, a);
+            join(e, next, b);
+            join(e, a, b);
+        }
+        last = next;
+    }
+    for (int i = 0; i < 50; i++) {
+        const int oxygen = addParticle(e, 16, Vec3(0, 3, 0.3 * i));
+        const int one = addParticle(e, 1, Vec3(0.08, 3.06, 0.3 * i)),
+                  other = addParticle(e, 1, Vec3(-0.08, 3.06, 0.3 * i));
+        join(e, oxygen, one);
+        join(e, oxygen, other);
+        join(e, one, other);
+        addParticle(e, 40, Vec3(0, 4, 0.3 * i));
+    }
+    std::shuffle(e.distances.begin(), e.distances.end(), generator);
+    return e;
+}
+
+// Rigid sections of three particles, whose centres are held together by three expressions of both.
+static Example makeRod(int sections) {
+    Example e;
+    for (int i = 0; i < sections; i++) {
+        const Vec3 centre(0.1 * i, 0, 0);
+        for (const Vec3& corner : {Vec3(0.01, 0.1, 0), Vec3(0, -0.05, 0.08), Vec3(-0.01, -0.05, -0.08)})
+            addParticle(e, 5, centre + corner);
+        for (const auto& pair : {std::make_pair(0, 1), {0, 2}, {1, 2}})
+            join(e, 3 * i + pair.first, 3 * i + pair.second);
+        if (i == 0)
+            continue;
+        vector<int> particles;
+        for (int p = 3 * i - 3; p < 3 * i + 3; p++)
+            particles.push_back(p);
+        for (const string& expression :
+             {string("(x4+x5+x6-x1-x2-x3)/3-length"), string("(y4+y5+y6-y1-y2-y3)/3+2*(z4-z1)*(x1-x2)"),
+              string("(z4+z5+z6-z1-z2-z3)/3+(y4-y1)*(x1-x2)")})
+            e.expressions.push_back({expression, particles, {}});
+        e.expressions[e.expressions.size() - 3].parameters["length"] = 0.1;
+    }
+    return e;
+}
+
+static SparseMatrix sparseJacobian(const ConstraintSystem& system, const vector<Vec3>& q) {
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    system.evaluateJacobian(q, jacobian);
+    vector<Eigen::Triplet<double>> triplets;
+    auto add = [&](int k, int particle, const Vec3& row) {
+        for (int j = 0; j < 3; j++)
+            triplets.emplace_back(k, 3 * particle + j, row[j]);
+    };
+    for (int k = 0; k < system.getNumConstraints(); k++)
+        if (!system.isExpression(k)) {
+            add(k, system.getConstraint(k).particle1, jacobian[k]);
+            add(k, system.getConstraint(k).particle2, jacobian[k] * -1.0);
+        }
+    for (const auto& row : system.getExpressionRows())
+        for (int entry = row.first; entry < row.end; entry++)
+            add(row.constraint, system.getParticleOf(entry), jacobian[entry]);
+    SparseMatrix result(system.getNumConstraints(), 3 * system.getNumParticles());
+    result.setFromTriplets(triplets.begin(), triplets.end());
+    return result;
+}
+
+static Eigen::VectorXd flatten(const vector<Vec3>& x) {
+    Eigen::VectorXd result(3 * x.size());
+    for (int i = 0; i < result.size(); i++)
+        result[i] = x[i / 3][i % 3];
+    return result;
+}
+
+static SparseMatrix sparseInverseMasses(const ConstraintSystem& system) {
+    vector<Eigen::Triplet<double>> triplets;
+    for (int i = 0; i < 3 * system.getNumParticles(); i++)
+        triplets.emplace_back(i, i, system.getInverseMasses()[i / 3]);
+    SparseMatrix result(triplets.size(), triplets.size());
+    result.setFromTriplets(triplets.begin(), triplets.end());
+    return result;
+}
+
+static Eigen::Map<const Eigen::VectorXd> numbers(const vector<double>& x) {
+    return Eigen::Map<const Eigen::VectorXd>(x.data(), (Eigen::Index) x.size());
+}
+
+// Every constraint and every particle once, and no particle of a piece in another piece's constraints.
+void testCut() {
+    vector<vector<int>> chain;
+    for (int i = 0; i < 5000; i++)
+        chain.push_back({1000 + (i * 3) % 5000, 1000 + (i * 3 + 3) % 5000}); // a ring, its particles in no order
+    const ClusterCut cut = cutCluster(chain, 500);
+    ASSERT_EQUAL(10, (int) cut.pieces.size());
+    ASSERT(cut.joints.size() <= 4 * cut.pieces.size()); // two ends, each way round the ring
+    std::set<int> constraints(cut.joints.begin(), cut.joints.end()), particles;
+    size_t numConstraints = cut.joints.size(), numParticles = 0;
+    for (const ClusterCut::Piece& piece : cut.pieces) {
+        const std::set<int> own(piece.particles.begin(), piece.particles.end());
+        for (int k : piece.constraints)
+            ASSERT(own.count(chain[k][0]) == 1 && own.count(chain[k][1]) == 1);
+        constraints.insert(piece.constraints.begin(), piece.constraints.end());
+        particles.insert(own.begin(), own.end());
+        numConstraints += piece.constraints.size();
+        numParticles += piece.particles.size();
+    }
+    ASSERT_EQUAL(chain.size(), numConstraints);
+    ASSERT_EQUAL(chain.size(), constraints.size());
+    ASSERT_EQUAL(5000, (int) numParticles);
+    ASSERT_EQUAL(5000, (int) particles.size());
+    // A sheet has no short cut, and a small cluster needs none.
+    vector<vector<int>> sheet;
+    const int edge = 70;
+    for (int i = 0; i < edge; i++)
+        for (int j = 0; j < edge; j++) {
+            if (i > 0)
+                sheet.push_back({edge * i + j, edge * (i - 1) + j});
+            if (j > 0)
+                sheet.push_back({edge * i + j, edge * i + j - 1});
+        }
+    ASSERT(cutCluster(sheet, 500).pieces.empty());
+    chain.resize(900);
+    ASSERT(cutCluster(chain, 500).pieces.empty());
+}
+
+void testMatrix(const Example& e) {
+    ConstraintSystem system(e.masses, e.distances, e.expressions);
+    ASSERT_EQUAL(1, (int) system.getCutClusters().size());
+    ASSERT(system.getPieces().size() > 10);
+    ConstraintMatrix matrix(system);
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    system.evaluateJacobian(e.positions, jacobian);
+    const SparseMatrix g = sparseJacobian(system, e.positions);
+    const SparseMatrix k = g * sparseInverseMasses(system) * g.transpose();
+    vector<double> b(system.getNumConstraints());
+    for (double& x : b)
+        x = uniform(-1, 1);
+    vector<double> all = b, inSteps = b;
+    for (int repeat = 0; repeat < 2; repeat++) { // the second time on top of the first
+        all = inSteps = b;
+        matrix.factorize(jacobian);
+        matrix.solve(all);
+        ASSERT((k * numbers(all) - numbers(b)).norm() <= 1e-9 * numbers(b).norm());
+        // As a step does it, the pieces in any order.
+        const ConstraintSystem::CutCluster& cluster = system.getCutClusters()[0];
+        for (auto piece = system.getPieces().rbegin(); piece != system.getPieces().rend(); ++piece) {
+            ASSERT_EQUAL(ConstraintMatrix::REGULAR, matrix.tryToFactorize(jacobian, *piece));
+            matrix.eliminate(inSteps, *piece, 1);
+        }
+        ASSERT_EQUAL(ConstraintMatrix::REGULAR, matrix.tryToFactorizeJoints(jacobian, cluster));
+        matrix.solveJoints(inSteps, cluster, 1);
+        for (const ConstraintSystem::Part& piece : system.getPieces())
+            matrix.substitute(inSteps, piece);
+        for (int c = system.getPieces()[0].first; c < cluster.joints.end; c++)
+            ASSERT_EQUAL(all[c], inSteps[c]);
+    }
+    // Products with G^T, piece by piece.
+    vector<Vec3> forces(e.masses.size()), byPieces = forces;
+    system.addTransposedOverMass(jacobian, b, 0.5, forces);
+    for (const ConstraintSystem::Part& piece : system.getPieces())
+        system.addTransposedOverMass(jacobian, b, 0.5, byPieces, piece);
+    for (const ConstraintSystem::Part& piece : system.getPieces())
+        for (int p = piece.firstParticle; p < piece.endParticle; p++) {
+            const int i = system.getGeneralParticles()[p];
+            ASSERT_EQUAL_VEC(forces[i], byPieces[i], 1e-12);
+        }
+}
+
+// The matrix of Newton's iteration, which takes a cut cluster as a whole.
+void testNewtonMatrix(const Example& e) {
+    ConstraintSystem system(e.masses, e.distances, e.expressions);
+    vector<Vec3> ahead = e.positions;
+    for (size_t i = 0; i < ahead.size(); i++)
+        ahead[i] += e.velocities[i] * 0.02;
+    ConstraintSystem::Jacobian current(system.getNumEntries()), next = current;
+    system.evaluateJacobian(e.positions, current);
+    system.evaluateJacobian(ahead, next);
+    const SparseMatrix a =
+        sparseJacobian(system, ahead) * sparseInverseMasses(system) * sparseJacobian(system, e.positions).transpose();
+    vector<double> b(system.getNumConstraints());
+    for (double& x : b)
+        x = uniform(-1, 1);
+    vector<double> x = b;
+    NewtonMatrix matrix(system);
+    ASSERT(matrix.factorize(next, current));
+    matrix.solve(x);
+    ASSERT((a * numbers(x) - numbers(b)).norm() <= 1e-9 * numbers(b).norm());
+}
+
+static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
+    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
+}
+
+static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+    vector<Vec3> forces;
+    for (size_t i = 0; i < positions.size(); i++)
+        forces.push_back(Vec3(5 * std::sin(positions[i][0]), -10 * positions[i][1], 3.0 - (double) (i % 7)));
+    return forces;
+}
+
+static void takeSteps(VRattleDynamics& dynamics, int steps) {
+    for (int i = 0; i < steps; i++) {
+        vector<Vec3> forces;
+        do {
+            dynamics.step(INFINITY);
+            forces = forcesAt(dynamics.getNextPositions());
+        } while (!dynamics.finish(forces, 0));
+    }
+}
+
+void testSteps(const Example& e, StepDensity::Update update) {
+    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    dynamics.setSettings(makeSettings(update));
+    vector<Vec3> start = e.positions;
+    dynamics.begin(start, e.velocities, forcesAt(start), 0);
+    takeSteps(dynamics, 1);
+    const vector<Vec3> after = dynamics.getPositions();
+    const ConstraintSystem& system = dynamics.getConstraintSystem();
+    const double reference = dynamics.getReference(0);
+    vector<double> g(system.getNumConstraints()), curvature(system.getNumConstraints());
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    for (int i = 0; i < 6; i++) {
+        const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
+        takeSteps(dynamics, 1);
+        const vector<Vec3>&q = dynamics.getPositions(), &v = dynamics.getVelocities();
+        system.evaluateJacobian(q, jacobian);
+        ASSERT(system.evaluate(q, g, jacobian) <= 1e-10);
+        system.evaluateCurvature(q, v, curvature);
+        const SparseMatrix rows = sparseJacobian(system, q), inverseMasses = sparseInverseMasses(system);
+        ASSERT((rows * flatten(v)).cwiseAbs().maxCoeff() < 1e-10); // the velocities are tangent
+        const SparseMatrix k = rows * inverseMasses * rows.transpose();
+        Eigen::SimplicialLDLT<SparseMatrix> factor(k);
+        const Eigen::VectorXd right = numbers(curvature) + rows * (inverseMasses * flatten(dynamics.getForces()));
+        const Eigen::VectorXd expected = factor.solve(right);
+        ASSERT((expected - numbers(dynamics.getMultipliers())).norm() <= 1e-8 * expected.norm());
+        ASSERT_EQUAL_TOL(std::sqrt(expected.dot(right)), dynamics.getMonitorValues()[0], 1e-9);
+        if (update == StepDensity::Explicit) { // (3.15)
+            StepDensity density(update, 0.002, 0.002 / 50, 0.004);
+            ASSERT_EQUAL_TOL(2 * density.limit(u) - before, dynamics.getDensity(), 1e-12);
+        }
+    }
+    ASSERT_EQUAL(0, dynamics.getNumRescues());
+    dynamics.reverse();
+    takeSteps(dynamics, 6);
+    for (size_t i = 0; i < after.size(); i++)
+        ASSERT_EQUAL_VEC(after[i], dynamics.getPositions()[i], 1e-9);
+}
+
+// Positions that are off by up to a hundredth of a bond come back.
+void testProjection(const Example& e) {
+    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    dynamics.setSettings(makeSettings(StepDensity::Explicit));
+    const ConstraintSystem& system = dynamics.getConstraintSystem();
+    vector<Vec3> positions = e.positions;
+    for (size_t i = 0; i < positions.size(); i++)
+        if (e.masses[i] > 0)
+            positions[i] += randomVector(0.0002);
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    vector<double> g(system.getNumConstraints());
+    system.evaluateJacobian(positions, jacobian);
+    ASSERT(system.evaluate(positions, g, jacobian) > 0.003);
+    ASSERT(dynamics.projectPositions(positions));
+    system.evaluateJacobian(positions, jacobian);
+    ASSERT(system.evaluate(positions, g, jacobian) <= 1e-10);
+}
+
+void testThreads(const Example& e) {
+    const VRattleDynamics::Settings automatic = {
+        0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {3000, 3000}, 0};
+    for (const VRattleDynamics::Settings& settings :
+         {makeSettings(StepDensity::SemiExplicit), makeSettings(StepDensity::Explicit), automatic}) {
+        vector<Vec3> positions;
+        vector<double> multipliers;
+        for (int numThreads : {1, 2, 3, 8}) {
+            VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+            int calls = 0;
+            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
+            dynamics.setSettings(settings);
+            dynamics.begin(e.positions, e.velocities, forcesAt(e.positions), 0);
+            if (settings.isAutomatic)
+                dynamics.startAutomatic({3300, 3200}, {3100, 3000});
+            takeSteps(dynamics, ThreadChoice::RUN_LENGTH + 3); // the last ones on one thread
+            ASSERT((calls > 0) == (numThreads > 1));
+            if (numThreads == 1) {
+                positions = dynamics.getPositions();
+                multipliers = dynamics.getMultipliers();
+            }
+            ASSERT(positions == dynamics.getPositions());
+            ASSERT(multipliers == dynamics.getMultipliers());
+        }
+    }
+}
+
+// A doubled bond is found within a piece and among the joints.
+void testDependentConstraints(const Example& e) {
+    const ConstraintSystem whole(e.masses, e.distances);
+    for (int k : {whole.getPieces()[1].first, whole.getCutClusters()[0].joints.first}) {
+        vector<DistanceConstraint> distances = e.distances;
+        distances.push_back(whole.getConstraint(k));
+        VRattleDynamics dynamics(e.masses, distances);
+        ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
+        dynamics.setSettings(makeSettings(StepDensity::Explicit));
+        assertThrows("redundant", [&] { dynamics.begin(e.positions, e.velocities, vector<Vec3>(e.masses.size()), 0); });
+    }
+}
+
+int main() {
+    const Example comb = makeComb(15500), rod = makeRod(3600);
+    return runTests({
+        {"the cut", testCut},
+        {"K and its factor, a comb", [&] { testMatrix(comb); }},
+        {"K and its factor, a rod", [&] { testMatrix(rod); }},
+        {"Newton's matrix, a comb", [&] { testNewtonMatrix(comb); }},
+        {"Newton's matrix, a rod", [&] { testNewtonMatrix(rod); }},
+        {"projection of a comb", [&] { testProjection(comb); }},
+        {"projection of a rod", [&] { testProjection(rod); }},
+        {"steps of a comb, SemiExplicit", [&] { testSteps(comb, StepDensity::SemiExplicit); }},
+        {"steps of a comb, Explicit", [&] { testSteps(comb, StepDensity::Explicit); }},
+        {"steps of a comb, Bounded", [&] { testSteps(comb, StepDensity::Bounded); }},
+        {"steps of a rod, SemiExplicit", [&] { testSteps(rod, StepDensity::SemiExplicit); }},
+        {"steps of a rod, Explicit", [&] { testSteps(rod, StepDensity::Explicit); }},
+        {"any number of threads, a comb", [&] { testThreads(comb); }},
+        {"any number of threads, a rod", [&] { testThreads(rod); }},
+        {"dependent constraints", [&] { testDependentConstraints(comb); }},
+    });
+}

@@ -1,0 +1,252 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// VRattleDynamics with forces of its own: clusters of every shape that has kernels, in odd and even numbers, beside
+// general ones, against a dense statement of the multipliers; and the same bits with any number of threads.
+
+#include "TestSupport.h"
+#include "step/VRattleDynamics.h"
+#include <Eigen/Dense>
+#include <cmath>
+#include <random>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+struct Example {
+    vector<double> masses;
+    vector<DistanceConstraint> constraints;
+    vector<Vec3> positions, velocities;
+    std::mt19937 random{5};
+
+    Vec3 randomVector(double scale) {
+        std::normal_distribution<double> normal;
+        return Vec3(normal(random), normal(random), normal(random)) * scale;
+    }
+    // Particles about a place, joined as the pairs say, by constraints as long as their distances happen to be.
+    void addCluster(const vector<double>& clusterMasses, const vector<std::pair<int, int>>& pairs,
+                    const vector<Vec3>& shape) {
+        const int first = (int) masses.size();
+        const Vec3 place = randomVector(2);
+        for (size_t i = 0; i < clusterMasses.size(); i++) {
+            masses.push_back(clusterMasses[i]);
+            positions.push_back(place + shape[i]);
+            velocities.push_back(randomVector(0.5));
+        }
+        for (const auto& pair : pairs) {
+            Vec3 r = shape[pair.first] - shape[pair.second];
+            constraints.push_back({first + pair.first, first + pair.second, std::sqrt(r.dot(r))});
+        }
+    }
+};
+
+static const vector<Vec3> SHAPE = {Vec3(), Vec3(0.1, 0, 0.01), Vec3(-0.03, 0.11, 0), Vec3(-0.02, -0.05, 0.09),
+                                   Vec3(-0.04, -0.05, -0.1)};
+
+static void makeExample(Example& e, int copies) {
+    for (int copy = 0; copy < copies; copy++) {
+        e.addCluster({12, 1}, {{0, 1}}, SHAPE);
+        e.addCluster({1, 16, 2}, {{1, 0}, {1, 2}}, {SHAPE[1], SHAPE[0], SHAPE[2]});
+        e.addCluster({12, 1, 1, 1}, {{0, 1}, {2, 0}, {0, 3}}, SHAPE);
+        e.addCluster({12, 1, 2, 3, 4}, {{0, 1}, {0, 2}, {0, 3}, {4, 0}}, SHAPE);
+        e.addCluster({16, 1, 1}, {{1, 2}, {0, 1}, {2, 0}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
+    }
+    // In no batch: a ring with a tail, and a free particle.
+    e.addCluster({12, 14, 16, 12, 1}, {{0, 1}, {1, 2}, {2, 3}, {3, 0}, {3, 4}}, SHAPE);
+    e.addCluster({40}, {}, SHAPE);
+}
+
+// Springs to the origin, one stiffness each, and a pull along the velocity-free direction (1, 2, -1).
+static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+    vector<Vec3> forces;
+    for (size_t i = 0; i < positions.size(); i++)
+        forces.push_back(positions[i] * (-20.0 - (double) (i % 7)) + Vec3(1, 2, -1) * (double) (i % 5));
+    return forces;
+}
+
+static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
+    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, 8, false};
+}
+
+// Both halves of a step; returns whether it is complete.
+static bool takeStep(VRattleDynamics& dynamics) {
+    dynamics.step(INFINITY);
+    vector<Vec3> forces = forcesAt(dynamics.getNextPositions());
+    return dynamics.finish(forces, 0);
+}
+
+static VRattleDynamics::Settings makeAutomaticSettings() {
+    // References far below the monitors' values, so that the density is not 1.
+    return {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {30, 20}, 0};
+}
+
+static void run(VRattleDynamics& dynamics, const Example& e, int steps, bool isAutomatic = false) {
+    vector<Vec3> positions = e.positions;
+    dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
+    if (isAutomatic)
+        dynamics.startAutomatic({120, 150}, {110, 140});
+    for (int i = 0; i < steps; i++)
+        while (!takeStep(dynamics)) {
+        }
+}
+
+// Lambda = K^-1 (g''(v,v) + G M^-1 F) for g = |r|^2 - d^2, in the order of the constraints.
+static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleDynamics& dynamics) {
+    const int m = (int) e.constraints.size(), n = 3 * (int) e.masses.size();
+    Eigen::MatrixXd g = Eigen::MatrixXd::Zero(m, n);
+    Eigen::VectorXd curvature(m), force(n), inverseMass(n);
+    const vector<Vec3>&q = dynamics.getPositions(), &v = dynamics.getVelocities(), &f = dynamics.getForces();
+    for (int i = 0; i < n; i++) {
+        force[i] = f[i / 3][i % 3];
+        inverseMass[i] = 1 / e.masses[i / 3];
+    }
+    for (int k = 0; k < m; k++) {
+        const int a = e.constraints[k].particle1, b = e.constraints[k].particle2;
+        Vec3 r = q[a] - q[b], w = v[a] - v[b];
+        for (int j = 0; j < 3; j++) {
+            g(k, 3 * a + j) = 2 * r[j];
+            g(k, 3 * b + j) = -2 * r[j];
+        }
+        curvature[k] = 2 * w.dot(w);
+        ASSERT(std::fabs(std::sqrt(r.dot(r)) / e.constraints[k].length - 1) <= 1e-10);
+        ASSERT(std::fabs(r.dot(w)) < 1e-11); // the velocities are tangent
+    }
+    Eigen::MatrixXd k = g * inverseMass.asDiagonal() * g.transpose();
+    return k.ldlt().solve(curvature + g * inverseMass.cwiseProduct(force));
+}
+
+void testShapes(StepDensity::Update update) {
+    for (int copies : {1, 2, 3}) {
+        Example e;
+        makeExample(e, copies);
+        VRattleDynamics dynamics(e.masses, e.constraints);
+        ASSERT(dynamics.getConstraintSystem().getBatches().size() == 5);
+        ASSERT_EQUAL((int) e.constraints.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
+        dynamics.setSettings(makeSettings(update));
+        run(dynamics, e, 1);
+        const double reference = dynamics.getReference(0);
+        for (int i = 0; i < 50; i++) {
+            const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
+            ASSERT(takeStep(dynamics));
+            Eigen::VectorXd expected = denseMultipliers(e, dynamics);
+            vector<double> found;
+            dynamics.getConstraintSystem().getGivenMultipliers(dynamics.getMultipliers(), found);
+            for (int k = 0; k < expected.size(); k++)
+                ASSERT(std::fabs(found[k] - expected[k]) <= 1e-9 * expected.norm());
+            ASSERT_EQUAL_TOL(expected.norm(), dynamics.getMonitorValues()[0], 1e-10);
+            if (update == StepDensity::Explicit) { // (3.15)
+                StepDensity density(update, 0.002, 0.002 / 50, 0.004);
+                ASSERT_EQUAL_TOL(2 * density.limit(u) - before, dynamics.getDensity(), 1e-12);
+            }
+        }
+        ASSERT_EQUAL(0, dynamics.getNumRescues());
+    }
+}
+
+// Without forces, all motion is the same in a frame that moves.
+void testChangedFrame() {
+    Example e;
+    makeExample(e, 2);
+    const vector<Vec3> noForces(e.masses.size());
+    auto takeFreeSteps = [&](VRattleDynamics& dynamics, int steps) {
+        double time = 0;
+        for (int i = 0; i < steps;) {
+            const double size = dynamics.step(INFINITY);
+            vector<Vec3> forces = noForces;
+            if (dynamics.finish(forces, 0)) {
+                time += size;
+                i++;
+            }
+        }
+        return time;
+    };
+    const Vec3 shift(0.3, -2, 0.7);
+    for (auto kind : {StepMonitor::ConstraintMultipliers, StepMonitor::VectorField}) {
+        VRattleDynamics resting(e.masses, e.constraints), moving(e.masses, e.constraints);
+        for (VRattleDynamics* dynamics : {&resting, &moving}) {
+            VRattleDynamics::Settings settings = makeSettings(StepDensity::SemiExplicit);
+            settings.terms[0].kind = kind;
+            settings.tolerance = 1e-12;
+            dynamics->setSettings(settings);
+            dynamics->begin(e.positions, e.velocities, noForces, 0);
+            takeFreeSteps(*dynamics, 20);
+        }
+        vector<Vec3> velocities = moving.getVelocities();
+        for (Vec3& v : velocities)
+            v += shift;
+        vector<Vec3> others = velocities;
+        others.back() += Vec3(0, 1e-9, 0);
+        ASSERT(!moving.changeFrame(others));
+        ASSERT_EQUAL_VEC(resting.getVelocities()[0], moving.getVelocities()[0], 0.0);
+        ASSERT(moving.changeFrame(velocities));
+        if (kind == StepMonitor::VectorField) { // which sees the frame
+            double square = 0;
+            for (size_t i = 0; i < velocities.size(); i++)
+                square += e.masses[i] * velocities[i].dot(velocities[i]);
+            ASSERT_EQUAL_TOL(std::sqrt(square), moving.getMonitorValues()[0], 1e-12);
+            continue;
+        }
+        const double time = takeFreeSteps(resting, 20);
+        ASSERT_EQUAL_TOL(time, takeFreeSteps(moving, 20), 1e-12);
+        ASSERT_EQUAL_TOL(resting.getDensity(), moving.getDensity(), 1e-10);
+        for (size_t i = 0; i < velocities.size(); i++)
+            ASSERT_EQUAL_VEC(resting.getPositions()[i] + shift * time, moving.getPositions()[i], 1e-11);
+    }
+}
+
+void testThreads() {
+    // Enough waters, and an odd number of them, for the batches to be shared.
+    Example e;
+    for (int i = 0; i < 4001; i++)
+        e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
+    const VRattleDynamics::Settings all[] = {makeSettings(StepDensity::SemiExplicit),
+                                             makeSettings(StepDensity::Explicit), makeAutomaticSettings()};
+    for (const VRattleDynamics::Settings& settings : all) {
+        vector<Vec3> positions;
+        double density = 0;
+        for (int numThreads : {1, 2, 3, 8}) {
+            VRattleDynamics dynamics(e.masses, e.constraints);
+            int calls = 0;
+            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
+            dynamics.setSettings(settings);
+            run(dynamics, e, ThreadChoice::RUN_LENGTH + 3, settings.isAutomatic); // the last ones on one thread
+            ASSERT((calls > 0) == (numThreads > 1));
+            if (numThreads == 1) {
+                positions = dynamics.getPositions();
+                density = dynamics.getDensity();
+            }
+            for (size_t i = 0; i < positions.size(); i++)
+                ASSERT_EQUAL_VEC(positions[i], dynamics.getPositions()[i], 0.0);
+            ASSERT_EQUAL(density, dynamics.getDensity());
+            ASSERT(density != 1);
+        }
+    }
+}
+
+// Whichever way is faster is chosen, whatever single steps took, and found again when it changes.
+void testThreadChoice() {
+    ThreadChoice choice;
+    for (double parallelTime : {0.5, 2.0, 0.7}) {
+        int numParallel = 0, numSteps = 0;
+        for (; numSteps < ThreadChoice::PERIOD; numSteps++) {
+            const bool isParallel = choice.isParallel();
+            numParallel += isParallel;
+            choice.add((isParallel ? parallelTime : 1.0) *
+                       (numSteps % 9 == 0 ? 20 : 1)); // now and then something else runs
+        }
+        const int inTrial = ThreadChoice::TRIAL_LENGTH / 2;
+        ASSERT_EQUAL(parallelTime < 1 ? numSteps - inTrial : inTrial, numParallel);
+    }
+}
+
+int main() {
+    return runTests({
+        {"clusters of every shape, SemiExplicit", [] { testShapes(StepDensity::SemiExplicit); }},
+        {"clusters of every shape, Explicit", [] { testShapes(StepDensity::Explicit); }},
+        {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
+        {"another frame of reference", testChangedFrame},
+        {"any number of threads", testThreads},
+        {"the choice of threads", testThreadChoice},
+    });
+}
