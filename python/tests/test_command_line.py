@@ -13,7 +13,6 @@ import numpy as np
 import openmm
 import openmmvrattle
 import pytest
-from citizen import solvated
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle import __main__ as command_line
@@ -29,6 +28,7 @@ from openmmvrattle.testsystems import (
     light_heavy_chain,
     rigid_waters,
 )
+from run_support import solvated
 
 
 def run_command(*arguments: str, **options):

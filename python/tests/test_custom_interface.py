@@ -17,7 +17,6 @@ import numpy as np
 import openmm
 import openmmvrattle
 import pytest
-from citizen import solvated
 from custom_support import largest, light_molecules, open_on, platform_parameters, variable
 from dense_reference import (
     chain,
@@ -34,6 +33,7 @@ from openmm import app, unit
 from openmmvrattle import CustomVariableStepRattleIntegrator as Custom
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters
+from run_support import solvated
 
 SETTINGS: list[dict[str, Any]] = [
     {},

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from citizen import FORCE_MONITOR, make_integrator, with_update
 from dense_reference import UPDATES, Model, chain, open_context, positions_of, velocities_of, waters
+from run_support import FORCE_MONITOR, make_integrator, with_update
 
 
 def prepare(model: Model, platform: str, update: str) -> tuple[Any, Any]:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from citizen import assert_same_run, fastest_platform, make_integrator, relax, smooth_cutoff, solvated, with_update
 from dense_reference import UPDATES, chain, open_context, positions_of, time_of, value, velocities_of, waters
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator
+from run_support import assert_same_run, fastest_platform, make_integrator, relax, smooth_cutoff, solvated, with_update
 
 BOX = 0.9
 

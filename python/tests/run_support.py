@@ -1,4 +1,4 @@
-# OpenMM-VRATTLE: what the tests of the integrator as a citizen of OpenMM share.
+# OpenMM-VRATTLE: integrators, systems and runs that several files of tests share.
 # SPDX-License-Identifier: MIT
 
 from __future__ import annotations

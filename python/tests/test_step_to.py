@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from citizen import make_integrator, with_update
 from dense_reference import UPDATES, Array, chain, double_pendulum, open_context, positions_of, time_of, value
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
+from run_support import make_integrator, with_update
 
 
 def densities(

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from citizen import BOLTZMANN, FORCE_MONITOR, make_integrator, relax, smooth_cutoff, solvated
 from dense_reference import Array, positions_of, time_of, value, velocities_of
 from openmm import app, unit
+from run_support import BOLTZMANN, FORCE_MONITOR, make_integrator, relax, smooth_cutoff, solvated
 
 WATERS = 60
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from citizen import assert_same_run, make_integrator
 from dense_reference import chain, energy_of, open_context, positions_of, time_of, value, velocities_of
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import constraint_error
+from run_support import assert_same_run, make_integrator
 
 
 def make_compound(step: float, ours_first: bool) -> tuple[Any, VariableStepRattleIntegrator, Any, int, int]:

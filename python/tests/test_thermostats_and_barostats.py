@@ -6,7 +6,10 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from citizen import (
+from dense_reference import UPDATES, open_context, positions_of, time_of, value, velocities_of, waters
+from openmm import app
+from openmmvrattle.testsystems import constraint_error
+from run_support import (
     BOLTZMANN,
     FORCE_MONITOR,
     degrees_of_freedom,
@@ -16,9 +19,6 @@ from citizen import (
     solvated,
     with_update,
 )
-from dense_reference import UPDATES, open_context, positions_of, time_of, value, velocities_of, waters
-from openmm import app
-from openmmvrattle.testsystems import constraint_error
 
 
 def test_water_at_constant_pressure() -> None:

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from citizen import (
+from dense_reference import UPDATES, Array, chain, energy_of, open_context, positions_of, value, velocities_of
+from openmm import app, unit
+from openmmvrattle import testsystems
+from run_support import (
     FORCE_MONITOR,
     degrees_of_freedom,
     fastest_platform,
@@ -20,9 +23,6 @@ from citizen import (
     solvated,
     with_update,
 )
-from dense_reference import UPDATES, Array, chain, energy_of, open_context, positions_of, value, velocities_of
-from openmm import app, unit
-from openmmvrattle import testsystems
 
 THERMAL = 0.00831446261815324 * 300  # kT at 300 K
 
