@@ -30,9 +30,9 @@ from pathlib import Path
 
 import numpy as np
 import openmm
-from openmmvrattle.advice import Advice, AdviceError, Candidate, advise_on, measured_gain
-from openmmvrattle.comparison import two_digits
-from openmmvrattle.measurement import IntegratorRun, methods_of, run_method
+from openmmvrattle.compare.advice import Advice, AdviceError, Candidate, advise_on, measured_gain
+from openmmvrattle.compare.comparison import two_digits
+from openmmvrattle.compare.measurement import IntegratorRun, methods_of, run_method
 from openmmvrattle.testsystems import SYSTEMS, TestSystem
 
 PARTS = (0.5, 1.0, 2.0)

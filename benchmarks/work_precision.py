@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 import openmm
-from openmmvrattle.comparison import compare, quick_settings, two_digits
+from openmmvrattle.compare.comparison import compare, quick_settings, two_digits
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, StepControl, TestSystem
 from PIL import Image
 

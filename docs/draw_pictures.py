@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from openmmvrattle.comparison import Comparison, compare, two_digits
-from openmmvrattle.plots import draw_comparison
+from openmmvrattle.compare.comparison import Comparison, compare, two_digits
+from openmmvrattle.compare.plots import draw_comparison
 from openmmvrattle.testsystems import SYSTEMS
 
 DEFAULT_PATH = Path(__file__).parent / "images" / "double-pendulum.png"

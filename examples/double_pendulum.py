@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import openmm
 from matplotlib.figure import Figure
-from openmmvrattle.comparison import Series, envelope, make_integrator, two_digits
+from openmmvrattle.compare.comparison import Series, envelope, make_integrator, two_digits
 from openmmvrattle.testsystems import MonitorSettings, StepControl, double_pendulum
 from rich import box
 from rich.console import Console

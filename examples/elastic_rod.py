@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import openmm
 from matplotlib.figure import Figure
-from openmmvrattle.comparison import Series, make_integrator, two_digits
+from openmmvrattle.compare.comparison import Series, make_integrator, two_digits
 from openmmvrattle.testsystems import MonitorSettings, StepControl, TestSystem, elastic_rod
 from rich import box
 from rich.console import Console

@@ -25,7 +25,7 @@ from .custom import ConstraintWarning, CustomVariableStepRattleIntegrator
 from .serialization import XmlSerializer
 
 if TYPE_CHECKING:
-    from .advice import advise
+    from .compare.advice import advise
     from .vrattle import VariableStepRattleIntegrator
 
 __all__ = [
@@ -91,7 +91,7 @@ def _load_compiled_part() -> list[str]:
     globals()["VariableStepRattleIntegrator"] = VariableStepRattleIntegrator
     # Found from the extension: in an editable install the Python files lie somewhere else.
     failures = _load_plugins(Path(_vrattle.__file__).parent / "lib" / "plugins")
-    from .advice import advise
+    from .compare.advice import advise
 
     globals()["advise"] = advise
     return failures

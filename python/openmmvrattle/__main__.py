@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import openmm
 
-from .commands import advise, compare, info
-from .commands.systems import UsageError
+from . import info
+from .compare.commands import advise, compare
+from .compare.commands.systems import UsageError
 
 _EXAMPLES = """examples:
   python -m openmmvrattle info

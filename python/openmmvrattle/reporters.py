@@ -35,7 +35,7 @@ from openmm import app, unit
 
 import openmmvrattle
 
-from .custom_settings import MONITOR_KINDS
+from .custom.settings import MONITOR_KINDS
 
 __all__ = ["StepSizeReporter", "run_for_time"]
 

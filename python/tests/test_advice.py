@@ -17,7 +17,7 @@ import openmmvrattle
 import pytest
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
-from openmmvrattle.advice import (
+from openmmvrattle.compare.advice import (
     BOUNDS,
     MONITORS,
     AdviceError,
@@ -27,7 +27,7 @@ from openmmvrattle.advice import (
     measured_gain,
     predictor,
 )
-from openmmvrattle.measurement import methods_of, run_method
+from openmmvrattle.compare.measurement import methods_of, run_method
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, light_heavy_chain, rigid_waters, water_clash
 
 

@@ -14,12 +14,11 @@ import openmm
 import openmmvrattle
 import pytest
 from openmm import app, unit
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import VariableStepRattleIntegrator, info
 from openmmvrattle import __main__ as command_line
-from openmmvrattle.commands import info
-from openmmvrattle.commands.systems import MONITORS, UPDATES, UsageError, chosen, monitors_from
-from openmmvrattle.comparison import compare
-from openmmvrattle.inputs import InputError, from_pdb, from_system, from_xml
+from openmmvrattle.compare.commands.systems import MONITORS, UPDATES, UsageError, chosen, monitors_from
+from openmmvrattle.compare.comparison import compare
+from openmmvrattle.compare.inputs import InputError, from_pdb, from_system, from_xml
 from openmmvrattle.testsystems import (
     MonitorSettings,
     TestSystem,
@@ -381,7 +380,7 @@ def test_what_a_platform_prints_is_not_in_the_output_of_info() -> None:
     """OpenCL warns of drivers that OpenMM was not tried with, on standard output."""
     script = (
         "import os, sys\n"
-        "from openmmvrattle.commands import info\n"
+        "from openmmvrattle import info\n"
         "make = info._integrators()['CustomVariableStepRattleIntegrator']\n"
         "def loud():\n"
         "    os.write(1, b'a warning')\n"

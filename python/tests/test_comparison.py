@@ -19,8 +19,8 @@ import pytest
 from openmmvrattle import __main__ as command_line
 from openmmvrattle import measurement as measurement_module
 from openmmvrattle import plots
-from openmmvrattle.commands.compare import print_comparison
-from openmmvrattle.comparison import (
+from openmmvrattle.compare.commands.compare import print_comparison
+from openmmvrattle.compare.comparison import (
     Comparison,
     IntegratorRun,
     Series,

@@ -14,8 +14,8 @@ from dense_reference import chain, energy_of, open_context, positions_of, time_o
 from openmm import app, unit
 from openmmvrattle import ConstraintWarning, VariableStepRattleIntegrator
 from openmmvrattle import CustomVariableStepRattleIntegrator as Custom
-from openmmvrattle.custom_program import make_program
-from openmmvrattle.custom_settings import MONITOR_KINDS, Monitor, Settings
+from openmmvrattle.custom.program import make_program
+from openmmvrattle.custom.settings import MONITOR_KINDS, Monitor, Settings
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain, rigid_waters
 
 # Names that mean something else to OpenMM: forces and energies of groups, and its own variables.

@@ -16,7 +16,7 @@ import pytest
 from dense_reference import EXPLICIT, SEMI_EXPLICIT, Control, DenseStepper, value
 from dense_rod import Rod, gradient_of
 from openmmvrattle import VariableStepRattleIntegrator
-from openmmvrattle.comparison import compare
+from openmmvrattle.compare.comparison import compare
 from openmmvrattle.testsystems import ExpressionConstraint, TestSystem, elastic_rod
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "rod_reference.json").read_text(encoding="utf-8"))

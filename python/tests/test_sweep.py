@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import openmm
 import pytest
-from openmmvrattle.comparison import Case, compare, verdict
-from openmmvrattle.measurement import (
+from openmmvrattle.compare.comparison import Case, compare, verdict
+from openmmvrattle.compare.measurement import (
     ACCURACY_TOLERANCE,
     INTEGRATORS,
     make_integrator,
@@ -29,8 +29,8 @@ from openmmvrattle.measurement import (
     run_method,
     run_to_accuracy,
 )
-from openmmvrattle.results import ResultFolder, mean_gains
-from openmmvrattle.sweep import DaskRunner, ProcessRunner, RunnerError, SerialRunner, run_sweep
+from openmmvrattle.compare.results import ResultFolder, mean_gains
+from openmmvrattle.compare.sweep import DaskRunner, ProcessRunner, RunnerError, SerialRunner, run_sweep
 from openmmvrattle.testsystems import (
     ComparisonSettings,
     MonitorSettings,
@@ -104,7 +104,7 @@ def test_the_custom_integrator_can_be_compared():
 
 
 def test_a_long_name_does_not_cut_a_column(clash_result):
-    from openmmvrattle.commands.compare import print_comparison
+    from openmmvrattle.compare.commands.compare import print_comparison
 
     run = replace(
         clash_result.runs[0], name="an integrator with a name that goes on and on and on", failure="it failed"
@@ -451,7 +451,7 @@ def test_a_sweep_over_systems_starts_and_steps(tmp_path):
 
 def test_all_systems_are_known_by_one_name():
     from openmmvrattle.__main__ import _parser
-    from openmmvrattle.commands import compare as command
+    from openmmvrattle.compare.commands import compare as command
     from openmmvrattle.testsystems import SYSTEMS
 
     options = _parser().parse_args(["compare", "--system", "all"])

@@ -14,7 +14,7 @@ import openmm
 import pytest
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator, testsystems
-from openmmvrattle.comparison import make_integrator
+from openmmvrattle.compare.comparison import make_integrator
 from openmmvrattle.testsystems import SYSTEMS
 
 WITHOUT_CONSTRAINTS = {"argon-cluster", "flexible-waters", "ion-pair"}

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..testsystems import SYSTEMS, TestSystem
+from ...testsystems import SYSTEMS, TestSystem
 from .systems import (
     UsageError,
     add_system_arguments,

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..testsystems import SYSTEMS, ComparisonSettings, StepControl, TestSystem
+from ...testsystems import SYSTEMS, ComparisonSettings, StepControl, TestSystem
 from .systems import (
     MONITORS,
     UPDATES,

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import openmm
 
-from .custom_settings import BOUNDED, PREFIX, Monitor, Settings
+from .settings import BOUNDED, PREFIX, Monitor, Settings
 
 MAXIMUM_PASSES = 30
 """How often the constraints are solved in search of one step density before the step is rescued."""

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import openmm
 
-from ..custom_settings import MONITOR_KINDS as MONITORS
+from ...custom.settings import MONITOR_KINDS as MONITORS
+from ...testsystems import SYSTEMS, MonitorSettings, TestSystem
 from ..inputs import CONSTRAINTS, DEFAULT_FORCE_FIELD, InputError, from_pdb, from_xml
-from ..testsystems import SYSTEMS, MonitorSettings, TestSystem
 
 UPDATES = ("SemiExplicit", "Explicit", "Bounded")
 """The recursions of the step density."""

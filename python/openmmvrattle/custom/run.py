@@ -11,7 +11,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from .custom_settings import INSTEAD, error
+from .settings import INSTEAD, error
 
 LOST = 1e-3
 """A relative error of a constrained distance that no run can recover from."""

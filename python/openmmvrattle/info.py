@@ -100,7 +100,7 @@ def _versions() -> dict[str, str]:
 
 def _built_for() -> str:
     try:
-        from .. import _build
+        from . import _build
     except ImportError:
         return "nothing was built"
     return _build.OPENMM_VERSION

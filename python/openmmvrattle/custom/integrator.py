@@ -1,6 +1,6 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""VRATTLE as an openmm.CustomIntegrator: in Python alone, for every platform; docs/custom.md explains how it works."""
+"""The integrator as its user sees it: settings, steps, copies."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from .custom_program import make_program
-from .custom_run import Run, find_context, positions_of, vectors, velocities_of
-from .custom_settings import (
+from .program import make_program
+from .run import Run, find_context, positions_of, vectors, velocities_of
+from .settings import (
     BOUNDED,
     EXPLICIT,
     INSTEAD,
