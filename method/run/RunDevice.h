@@ -1,0 +1,183 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_RUNDEVICE_H_
+#define OPENMMVRATTLE_RUNDEVICE_H_
+
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+struct IntegratorSettings;
+struct RunState;
+
+/**
+ * All that a run needs of a platform: IntegratorRun decides what is to be done, a device does it where the positions are.
+ *
+ * Two states are to be kept apart. The Context's is what users see and may change. The method's is the on-step state
+ * (q[n], v[n], F(q[n]), Lambda, U, rho[n-1/2] and what goes with it) that satisfies the constraints. The two are the same once
+ * a step is complete. After start(), changeState() and changeVelocities() the method's may be a projection of the Context's,
+ * which keeps the numbers that the user or a Force has given it until the next step is complete.
+ *
+ * step() need not have happened when it returns: a device may only have asked for it, and look at nothing. The run calls it again
+ * and again, with updateState() and findChange() between, and then settle() once; a function that returns a number of the state
+ * (getTime(), getLastStep(), getMonitorValues(), ...) waits for what it needs. A step that fails on a device that does not
+ * look must leave the state before it, and everything asked for afterwards must have no effect, until settle() reports it.
+ *
+ * **No function that throws leaves a trace**: the state of the Context (with its time, its step count and the positions of virtual
+ * sites) and the method's, references, densities and the last step are as they were before the call; for step() and settle(),
+ * as before the step that failed. Work that was done is counted. Functions that take no step but need forces count them too.
+ * What a Force throws passes through as it is.
+ */
+class RunDevice {
+public:
+    virtual ~RunDevice() = default;
+
+    // ------------------------------------------------------------------------------------------------- the settings
+
+    /**
+     * Take over settings, which are valid and consistent (IntegratorSettings::requireConsistent()). Called before everything
+     * else, and again between steps when they have changed. In the course of a run the density goes on where the new settings allow
+     * it: it is scaled with u = U/U_ref. Values of parameters of expressions are compared with those in force.
+     *
+     * @throws StepFailure    if the System cannot have one of the monitors
+     */
+    virtual void setSettings(const IntegratorSettings& settings) = 0;
+    /** The reference values in force of the monitors, or of the two of automatic step control; 0 where there is none yet. */
+    virtual std::vector<double> getReferences() = 0;
+    /** Put reference values in force, as from a saved run or a trial run; 0 for those that are not known. */
+    virtual void setReferences(const std::vector<double>& references) = 0;
+
+    // -------------------------------------------------------------------------------------- what happens to the Context
+
+    /**
+     * Let the Forces that act between steps do so (ContextImpl::updateContextState(): thermostats, barostats), which may ask for
+     * the size of the last step on the host.
+     *
+     * @return whether one of them says that the forces are no longer valid
+     */
+    virtual bool updateState() = 0;
+    /** What there is to find of a change that nobody has announced, from the least to the greatest. */
+    enum class Change {
+        None,
+        Velocities, /**< the velocities of the Context are others */
+        State,      /**< so are the positions */
+        Box         /**< so are the periodic box vectors */
+    };
+    /**
+     * Look whether the Context's positions, velocities and box are still those of the last step, or those last told by start(),
+     * changeState() and changeVelocities(). Changes come from Forces and from other integrators (of a CompoundIntegrator); what
+     * users change is announced to the run, so a device looks only where there may be something to find.
+     */
+    virtual Change findChange() = 0;
+    /**
+     * A number made from the Context's positions, velocities, box and parameters, by which a saved run knows again the state that it
+     * belongs to; without what is no part of a State that somebody may load. It does not change by reading it.
+     */
+    virtual unsigned long long getFingerprint() = 0;
+
+    /**
+     * Start afresh from the Context's state: positions and velocities are moved onto the constraints, the forces computed there,
+     * and Lambda and U found. There is no density yet: the next step is the first of a sequence. References stay.
+     *
+     * @throws StepFailure    if that is not possible
+     */
+    virtual void start() = 0;
+    /** Go on from a state that a Force has changed (a barostat, say): as start(), but the density goes on, scaled with u. */
+    virtual void changeState() = 0;
+    /** Go on with changed velocities at the same positions, without computing forces; the density goes on, scaled with u. */
+    virtual void changeVelocities() = 0;
+
+    // ----------------------------------------------------------------------------------------------------- the steps
+
+    /** Whether the next step continues a sequence of densities; if not, it is a first one. */
+    virtual bool hasStarted() = 0;
+    /**
+     * Take one step: (3.9)-(3.11) and (3.14), virtual sites, time and step count of its end, the forces there, (3.12)-(3.13).
+     * A first step that has to be taken twice is (see VRattleDynamics::finish()). May only ask for it, see above.
+     *
+     * @param maxTime    the step must not go beyond this time (ps); one that is cut short for it ends there exactly
+     * @throws StepFailure    if it cannot be completed and that is known already
+     */
+    virtual void step(double maxTime) = 0;
+    /**
+     * Wait for the steps that were asked for.
+     *
+     * @throws StepFailure    if one of them could not be completed; then those after it have not happened
+     */
+    virtual void settle() = 0;
+    /** Turn time around without computing forces: VRattleDynamics::reverse(), and the Context's velocities change sign. */
+    virtual void reverse() = 0;
+
+    struct LastStep {
+        double size;    // ps; 0 before the first step of this device
+        double density; // rho, of reverse() too; 1 before the first step
+    };
+    /** Of the last step that was completed; while others are asked for, of the last of these. */
+    virtual LastStep getLastStep() = 0;
+    /** The time of the Context (ps). */
+    virtual double getTime() = 0;
+    virtual long long getStepCount() = 0;
+
+    // -------------------------------------------------------------------------------------- trial runs of fixed steps
+
+    /**
+     * Begin to take steps of a fixed size from the method's state, which have no density and are put back by endTrial(). What is
+     * asked of the device in between concerns the trial, but for time and step count, which stay as they are.
+     *
+     * @param stepSize       the size of all steps (ps)
+     * @param isBackwards    whether they go back in time (from the same positions with velocities of the other sign)
+     */
+    virtual void beginTrial(double stepSize, bool isBackwards) = 0;
+    /** Take one; may throw a StepFailure at once. The trial is over then too, and its effects put back. */
+    virtual void takeTrialStep() = 0;
+    /** Put back everything but the counts of work. Does nothing if there is no trial. */
+    virtual void endTrial() = 0;
+
+    // -------------------------------------------------------------------------------------- numbers at the method's state
+
+    /** U_k(q[n],p[n]) of each monitor; with automatic step control U_A[n] and U_B[n-1/2], the latter 0 before a step. */
+    virtual std::vector<double> getMonitorValues() = 0;
+    /** Lambda(q[n],p[n]), for the System's constraints and behind them for the expressions, in the users' units. */
+    virtual std::vector<double> getMultipliers() = 0;
+    /** How often forces have been computed, iterations of the solver taken, and steps rescued, since the device exists. */
+    virtual long long getNumForceEvaluations() = 0;
+    virtual long long getNumSolverIterations() = 0;
+    virtual long long getNumRescues() = 0;
+
+    // ---------------------------------------------------------------------------------------- automatic step control
+
+    /** A value of its monitors below this is zero but for rounding, at the velocities of the method's state. */
+    virtual double getNegligibleValue() = 0;
+    /** The density that values of its monitors alone ask for. */
+    virtual double densityOf(const std::vector<double>& values) = 0;
+    /**
+     * Start the densities from two steps backwards in time; see AutomaticControl::start(). The references must be in force.
+     *
+     * @param back          U_A[-1] and U_B[-1/2]
+     * @param secondBack    U_A[-2] and U_B[-3/2]
+     */
+    virtual void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) = 0;
+
+    // ------------------------------------------------------------------------------------------- saving and resuming
+
+    /**
+     * Write down what the method goes on with beside settings and the state of the Context: all of RunState behind startsAfresh.
+     * This is where vectors leave the device.
+     */
+    virtual void save(RunState& run) = 0;
+    /**
+     * Go on from a saved run, whose settings and references are in force and whose fingerprint is the Context's. Where the forces
+     * are computed for it they are compared with the saved ones, for a Force may have been changed since.
+     *
+     * @return whether it goes on; if not, because the forces are others or the run was saved by a device that keeps other numbers,
+     *         nothing has been taken over
+     * @throws OpenMMException    if the parts of the saved run do not fit together
+     */
+    virtual bool resume(const RunState& run) = 0;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_RUNDEVICE_H_
