@@ -496,6 +496,10 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
         const Trial trial = {w, 0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext};
         const StepArrays arrays = stepArrays(trial);
+        work.runOnJoints([&](const CutCluster& cluster) { // before the pieces, whose particles the joints pull at
+            for (int k = cluster.joints.first; k < cluster.joints.end; k++)
+                lambdaNext[k] += correction[k];
+        });
         const Result result =
             work.run([](int) {},
                      [&](const ClusterBatch& batch, int begin, int end, Result& share) {

@@ -1,10 +1,10 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// Once a run is going, a step allocates no memory.
+// Once a run is going, a step allocates no memory; so it does not fall back on Newton's full matrix, which would.
 
+#include "Examples.h"
 #include "TestSupport.h"
-#include "step/VRattleDynamics.h"
 #include <atomic>
 #include <cmath>
 #include <cstdlib>
@@ -34,25 +34,6 @@ void operator delete(void* memory, std::size_t) noexcept {
 }
 #endif
 
-struct Example {
-    vector<double> masses;
-    vector<DistanceConstraint> distances;
-    vector<ExpressionConstraint> expressions;
-    vector<Vec3> positions, velocities;
-
-    int add(double mass, const Vec3& position) {
-        const int i = (int) masses.size();
-        masses.push_back(mass);
-        positions.push_back(position);
-        velocities.push_back(Vec3(0.1 * std::sin(3 * i), 0.1 * std::sin(5 * i), 0.1 * std::sin(7 * i)));
-        return i;
-    }
-    void join(int i, int j) {
-        const Vec3 r = positions[i] - positions[j];
-        distances.push_back({i, j, std::sqrt(r.dot(r))});
-    }
-};
-
 // Waters, zigzag chains of which one is cut into pieces, angles held by expressions, and free particles.
 static Example makeExample() {
     Example e;
@@ -66,12 +47,7 @@ static Example makeExample() {
         }
     }
     for (int n = 0; n < 200; n++) {
-        const Vec3 place(n, -5, 0);
-        const int oxygen = e.add(16, place), one = e.add(1, place + Vec3(0.08, 0.06, 0)),
-                  other = e.add(1, place + Vec3(-0.08, 0.06, 0));
-        e.join(oxygen, one);
-        e.join(oxygen, other);
-        e.join(one, other);
+        e.addWater(Vec3(n, -5, 0));
         const Vec3 corner(n, -10, 0);
         const int a = e.add(12, corner + Vec3(0.1, 0, 0)), b = e.add(12, corner),
                   c = e.add(12, corner + Vec3(0, 0.1, 0));

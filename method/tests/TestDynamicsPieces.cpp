@@ -4,9 +4,9 @@
 // Clusters so large that they are cut into pieces: the cut, K and the steps against Eigen's sparse factorisation of the same matrix,
 // and the same bits with any number of threads.
 
+#include "Examples.h"
 #include "TestSupport.h"
 #include "constraints/ClusterCut.h"
-#include "step/VRattleDynamics.h"
 #include <Eigen/SparseCholesky>
 #include <Eigen/SparseCore>
 #include <cmath>
@@ -20,13 +20,6 @@ using std::vector;
 
 typedef Eigen::SparseMatrix<double> SparseMatrix;
 
-struct Example {
-    vector<double> masses;
-    vector<DistanceConstraint> distances;
-    vector<ExpressionConstraint> expressions;
-    vector<Vec3> positions, velocities;
-};
-
 static std::mt19937 generator(11);
 
 static double uniform(double from, double to) {
@@ -36,75 +29,6 @@ static double uniform(double from, double to) {
 static Vec3 randomVector(double scale) {
     std::normal_distribution<double> normal;
     return Vec3(normal(generator), normal(generator), normal(generator)) * scale;
-}
-
-static int addParticle(Example& e, double mass, const Vec3& position) {
-    e.masses.push_back(mass);
-    e.positions.push_back(position);
-    e.velocities.push_back(randomVector(0.3));
-    return (int) e.masses.size() - 1;
-}
-
-static void join(Example& e, int i, int j) {
-    const Vec3 r = e.positions[i] - e.positions[j];
-    e.distances.push_back({i, j, std::sqrt(r.dot(r))});
-}
-
-// A backbone held by an anchor at one end, a side group at each third particle and a triangle at each seventh, beside some waters
-// and free particles. The constraints stand in no order.
-static Example makeComb(int backbone) {
-    Example e;
-    int last = addParticle(e, 0, Vec3());
-    e.velocities.back() = Vec3();
-    for (int i = 1; i < backbone; i++) {
-        const Vec3 place = Vec3(0.12 * i, 0.05 * (i % 2), 0) + randomVector(0.02);
-        const int next = addParticle(e, uniform(10, 40), place);
-        join(e, last, next);
-        if (i % 3 == 0)
-            join(e, next, addParticle(e, 1, place + Vec3(0, 0.1, 0.03)));
-        if (i % 7 == 0) {
-            const int a = addParticle(e, 2, place + Vec3(0.02, 0, 0.1)),
-                      b = addParticle(e, 3, place - Vec3(0.03, 0, 0.1));
-            join(e, next, a);
-            join(e, next, b);
-            join(e, a, b);
-        }
-        last = next;
-    }
-    for (int i = 0; i < 50; i++) {
-        const int oxygen = addParticle(e, 16, Vec3(0, 3, 0.3 * i));
-        const int one = addParticle(e, 1, Vec3(0.08, 3.06, 0.3 * i)),
-                  other = addParticle(e, 1, Vec3(-0.08, 3.06, 0.3 * i));
-        join(e, oxygen, one);
-        join(e, oxygen, other);
-        join(e, one, other);
-        addParticle(e, 40, Vec3(0, 4, 0.3 * i));
-    }
-    std::shuffle(e.distances.begin(), e.distances.end(), generator);
-    return e;
-}
-
-// Rigid sections of three particles, whose centres are held together by three expressions of both.
-static Example makeRod(int sections) {
-    Example e;
-    for (int i = 0; i < sections; i++) {
-        const Vec3 centre(0.1 * i, 0, 0);
-        for (const Vec3& corner : {Vec3(0.01, 0.1, 0), Vec3(0, -0.05, 0.08), Vec3(-0.01, -0.05, -0.08)})
-            addParticle(e, 5, centre + corner);
-        for (const auto& pair : {std::make_pair(0, 1), {0, 2}, {1, 2}})
-            join(e, 3 * i + pair.first, 3 * i + pair.second);
-        if (i == 0)
-            continue;
-        vector<int> particles;
-        for (int p = 3 * i - 3; p < 3 * i + 3; p++)
-            particles.push_back(p);
-        for (const string& expression :
-             {string("(x4+x5+x6-x1-x2-x3)/3-length"), string("(y4+y5+y6-y1-y2-y3)/3+2*(z4-z1)*(x1-x2)"),
-              string("(z4+z5+z6-z1-z2-z3)/3+(y4-y1)*(x1-x2)")})
-            e.expressions.push_back({expression, particles, {}});
-        e.expressions[e.expressions.size() - 3].parameters["length"] = 0.1;
-    }
-    return e;
 }
 
 static SparseMatrix sparseJacobian(const ConstraintSystem& system, const vector<Vec3>& q) {
@@ -252,23 +176,6 @@ void testNewtonMatrix(const Example& e) {
 
 static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
-}
-
-static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
-    vector<Vec3> forces;
-    for (size_t i = 0; i < positions.size(); i++)
-        forces.push_back(Vec3(5 * std::sin(positions[i][0]), -10 * positions[i][1], 3.0 - (double) (i % 7)));
-    return forces;
-}
-
-static void takeSteps(VRattleDynamics& dynamics, int steps) {
-    for (int i = 0; i < steps; i++) {
-        vector<Vec3> forces;
-        do {
-            dynamics.step(INFINITY);
-            forces = forcesAt(dynamics.getNextPositions());
-        } while (!dynamics.finish(forces, 0));
-    }
 }
 
 void testSteps(const Example& e, StepDensity::Update update) {
