@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -67,23 +68,26 @@ public:
     static constexpr int B = Topology::numBonds;
     static constexpr int P = Topology::numParticles;
 
-    BatchOf(const vector<double>& masses, const vector<double>& lengths, const vector<int>& particleTable,
-            int firstConstraint) :
-            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) particleTable.size() / P) {
-        for (int i = 0; i < P; i++)
-            inverseMass[i] = packOf(masses[i]);
-        for (int k = 0; k < B; k++) {
-            squareLength[k] = packOf(lengths[k] * lengths[k]);
-            inverseSquareLength[k] = packOf(1 / (lengths[k] * lengths[k]));
-        }
-        // C of K_kl = C_kl (row_k . row_l)
-        for (int k = 0; k < B; k++)
-            for (int l = 0; l < B; l++) {
-                double sum = 0;
-                for (int i = 0; i < P; i++)
-                    sum += signOf<Topology>(i, k) * signOf<Topology>(i, l) * masses[i];
-                massCoupling[k][l] = packOf(sum);
+    BatchOf(const vector<ClusterShape>& clusters, const vector<int>& particleTable, int firstConstraint) :
+            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) clusters.size()) {
+        // Few packs differ in most systems: then their shapes stay in the processor's cache.
+        std::map<ClusterShape, int> numberOf;
+        vector<int> number;
+        for (const ClusterShape& cluster : clusters)
+            number.push_back(numberOf.emplace(cluster, (int) numberOf.size()).first->second);
+        std::map<vector<int>, int> placeOf;
+        for (int first = 0; first < numClusters; first += PACK_SIZE) {
+            vector<int> pack;
+            for (int lane = 0; lane < PACK_SIZE; lane++)
+                pack.push_back(number[std::min(first + lane, numClusters - 1)]);
+            const auto found = placeOf.emplace(pack, (int) shapes.size());
+            if (found.second) {
+                shapes.emplace_back();
+                for (int lane = 0; lane < PACK_SIZE; lane++)
+                    fill(shapes.back(), lane, clusters[std::min(first + lane, numClusters - 1)]);
             }
+            shapeOfPack.push_back(found.first->second);
+        }
     }
 
     int getSize() const override {
@@ -113,6 +117,11 @@ private:
         const int* particle[PACK_SIZE];
         int constraint[PACK_SIZE];
     };
+    /** Masses and lengths of the clusters of a pack. */
+    struct Shape {
+        Pack inverseMass[P], squareLength[B], inverseSquareLength[B];
+        Pack massCoupling[B][B]; // C of K_kl = C_kl (row_k . row_l)
+    };
     /** G(q), by bonds, and K = L D L^T. */
     struct Factor {
         PackVector row[B];
@@ -120,6 +129,24 @@ private:
         Pack inversePivot[B];
     };
 
+    static void fill(Shape& shape, int lane, const ClusterShape& cluster) {
+        for (int i = 0; i < P; i++)
+            shape.inverseMass[i][lane] = cluster.inverseMasses[i];
+        for (int k = 0; k < B; k++) {
+            const double square = cluster.lengths[k] * cluster.lengths[k];
+            shape.squareLength[k][lane] = square;
+            shape.inverseSquareLength[k][lane] = 1 / square;
+            for (int l = 0; l < B; l++) {
+                double sum = 0;
+                for (int i = 0; i < P; i++)
+                    sum += signOf<Topology>(i, k) * signOf<Topology>(i, l) * cluster.inverseMasses[i];
+                shape.massCoupling[k][l][lane] = sum;
+            }
+        }
+    }
+    const Shape& shapeOf(int cluster) const {
+        return shapes[shapeOfPack[cluster / PACK_SIZE]];
+    }
     Lanes lanesOf(int cluster, int end) const {
         Lanes lanes;
         for (int lane = 0; lane < PACK_SIZE; lane++) {
@@ -156,33 +183,36 @@ private:
     }
 
     /** Rows and factor of K at bond vectors r. */
-    void factorize(const PackVector* r, Factor& factor) const;
+    static void factorize(const Shape& shape, const PackVector* r, Factor& factor);
     /** The smallest D_k/K_kk of a factor. */
-    void keepSmallestPivot(const Factor& factor, double& smallest) const;
-    void solve(const Factor& factor, Pack* x) const;
+    static void keepSmallestPivot(const Shape& shape, const Factor& factor, double& smallest);
+    static void solve(const Factor& factor, Pack* x);
     /** result_k = sum_l C_kl x_l row_l: the bond vectors of M^-1 G^T x. */
-    void addConstraintBonds(const Factor& factor, const Pack* x, Pack scale, PackVector* bonds) const;
+    static void addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
+                                   PackVector* bonds);
     /** x_i += scale / mass * (G^T x)_i */
-    void addConstraintForces(const Factor& factor, const Pack* x, Pack scale, PackVector* particleVectors) const;
+    static void addConstraintForces(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
+                                    PackVector* particleVectors);
     /** g = (|r|^2 - L^2)/(2 L^2). */
-    void evaluate(const PackVector* r, Pack* g) const {
+    static void evaluate(const Shape& shape, const PackVector* r, Pack* g) {
         for (int k = 0; k < B; k++)
-            g[k] = packOf(0.5) * (dot(r[k], r[k]) - squareLength[k]) * inverseSquareLength[k];
+            g[k] = packOf(0.5) * (dot(r[k], r[k]) - shape.squareLength[k]) * shape.inverseSquareLength[k];
     }
 
     vector<int> particles;
     int firstConstraint, numClusters;
-    Pack inverseMass[P], squareLength[B], inverseSquareLength[B], massCoupling[B][B];
+    vector<Shape> shapes; // that occur
+    vector<int> shapeOfPack;
 };
 
-template <class Topology> void BatchOf<Topology>::factorize(const PackVector* r, Factor& factor) const {
+template <class Topology> void BatchOf<Topology>::factorize(const Shape& shape, const PackVector* r, Factor& factor) {
     for (int k = 0; k < B; k++)
-        factor.row[k] = r[k] * inverseSquareLength[k];
+        factor.row[k] = r[k] * shape.inverseSquareLength[k];
     for (int j = 0; j < B; j++) {
         Pack scaled[B]; // L_jk D_k
-        Pack pivot = massCoupling[j][j] * dot(factor.row[j], factor.row[j]);
+        Pack pivot = shape.massCoupling[j][j] * dot(factor.row[j], factor.row[j]);
         for (int k = 0; k < j; k++) {
-            scaled[k] = massCoupling[j][k] * dot(factor.row[j], factor.row[k]);
+            scaled[k] = shape.massCoupling[j][k] * dot(factor.row[j], factor.row[k]);
             for (int l = 0; l < k; l++)
                 scaled[k] -= scaled[l] * factor.lower[k][l];
         }
@@ -194,9 +224,10 @@ template <class Topology> void BatchOf<Topology>::factorize(const PackVector* r,
     }
 }
 
-template <class Topology> void BatchOf<Topology>::keepSmallestPivot(const Factor& factor, double& smallest) const {
+template <class Topology>
+void BatchOf<Topology>::keepSmallestPivot(const Shape& shape, const Factor& factor, double& smallest) {
     for (int k = 0; k < B; k++) {
-        Pack inverse = factor.inversePivot[k] * massCoupling[k][k] * dot(factor.row[k], factor.row[k]);
+        Pack inverse = factor.inversePivot[k] * shape.massCoupling[k][k] * dot(factor.row[k], factor.row[k]);
         for (int lane = 0; lane < PACK_SIZE; lane++) {
             double relative = 1 / inverse[lane];
             if (relative < smallest || std::isnan(relative))
@@ -205,7 +236,7 @@ template <class Topology> void BatchOf<Topology>::keepSmallestPivot(const Factor
     }
 }
 
-template <class Topology> void BatchOf<Topology>::solve(const Factor& factor, Pack* x) const {
+template <class Topology> void BatchOf<Topology>::solve(const Factor& factor, Pack* x) {
     for (int i = 1; i < B; i++)
         for (int k = 0; k < i; k++)
             x[i] -= factor.lower[i][k] * x[k];
@@ -217,23 +248,24 @@ template <class Topology> void BatchOf<Topology>::solve(const Factor& factor, Pa
 }
 
 template <class Topology>
-void BatchOf<Topology>::addConstraintBonds(const Factor& factor, const Pack* x, Pack scale, PackVector* bonds) const {
+void BatchOf<Topology>::addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
+                                           PackVector* bonds) {
     PackVector force[B];
     for (int l = 0; l < B; l++)
         force[l] = factor.row[l] * (scale * x[l]);
     for (int k = 0; k < B; k++)
         for (int l = 0; l < B; l++)
-            bonds[k] = bonds[k] + force[l] * massCoupling[k][l];
+            bonds[k] = bonds[k] + force[l] * shape.massCoupling[k][l];
 }
 
 template <class Topology>
-void BatchOf<Topology>::addConstraintForces(const Factor& factor, const Pack* x, Pack scale,
-                                            PackVector* particleVectors) const {
+void BatchOf<Topology>::addConstraintForces(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
+                                            PackVector* particleVectors) {
     for (int k = 0; k < B; k++) {
         const PackVector force = factor.row[k] * (scale * x[k]);
         const int i = Topology::first(k), j = Topology::second(k);
-        particleVectors[i] = particleVectors[i] + force * inverseMass[i];
-        particleVectors[j] = particleVectors[j] - force * inverseMass[j];
+        particleVectors[i] = particleVectors[i] + force * shape.inverseMass[i];
+        particleVectors[j] = particleVectors[j] - force * shape.inverseMass[j];
     }
 }
 
@@ -245,17 +277,18 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
     double worst = 0;
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
         const Lanes lanes = lanesOf(cluster, end);
+        const Shape& shape = shapeOf(cluster);
         PackVector q[P], w[P], r[B], unconstrained[B], next[B];
         for (int i = 0; i < P; i++) {
             q[i] = load(lanes, i, step.q);
-            w[i] = load(lanes, i, step.start) + load(lanes, i, step.force) * (kick * inverseMass[i]);
+            w[i] = load(lanes, i, step.start) + load(lanes, i, step.force) * (kick * shape.inverseMass[i]);
         }
         for (int k = 0; k < B; k++) {
             r[k] = bondOf(q, k);
             unconstrained[k] = r[k] + bondOf(w, k) * drift;
         }
         Factor factor;
-        factorize(r, factor);
+        factorize(shape, r, factor);
         Pack lambda[B], g[B];
         for (int k = 0; k < B; k++)
             lambda[k] = load(lanes, k, step.lambda);
@@ -263,8 +296,8 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
         int iteration = 0;
         while (true) {
             std::copy(unconstrained, unconstrained + B, next);
-            addConstraintBonds(factor, lambda, scale, next);
-            evaluate(next, g);
+            addConstraintBonds(shape, factor, lambda, scale, next);
+            evaluate(shape, next, g);
             error = 0;
             for (int k = 0; k < B; k++)
                 keepLargest(error, g[k]);
@@ -282,7 +315,7 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
         iterations = std::max(iterations, iteration);
         if (error > worst || std::isnan(error))
             worst = error;
-        addConstraintForces(factor, lambda, -kick, w);
+        addConstraintForces(shape, factor, lambda, -kick, w);
         for (int i = 0; i < P; i++) {
             store(lanes, i, w[i], step.wNext);
             store(lanes, i, q[i] + w[i] * drift, step.qNext);
@@ -299,10 +332,11 @@ template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays
     double worst = 0;
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
         const Lanes lanes = lanesOf(cluster, end);
+        const Shape& shape = shapeOf(cluster);
         PackVector q[P], w[P], acceleration[P], r[B], next[B];
         for (int i = 0; i < P; i++) {
             q[i] = load(lanes, i, step.q);
-            acceleration[i] = load(lanes, i, step.force) * inverseMass[i];
+            acceleration[i] = load(lanes, i, step.force) * shape.inverseMass[i];
             w[i] = load(lanes, i, step.start) + acceleration[i] * kick;
         }
         for (int k = 0; k < B; k++) {
@@ -310,21 +344,21 @@ template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays
             next[k] = r[k] + bondOf(w, k) * drift;
         }
         Factor factor;
-        factorize(r, factor);
+        factorize(shape, r, factor);
         Pack lambda[B], g[B], multipliers[B];
         for (int k = 0; k < B; k++) {
             lambda[k] = load(lanes, k, step.lambda) + load(lanes, k, step.change);
             store(lanes, k, lambda[k], step.lambda);
         }
-        addConstraintBonds(factor, lambda, scale, next);
-        evaluate(next, g);
+        addConstraintBonds(shape, factor, lambda, scale, next);
+        evaluate(shape, next, g);
         for (int k = 0; k < B; k++)
             keepLargest(worst, g[k]);
         // Lambda(q, p+) = K^-1 (g''(w+,w+) + G M^-1 F)
         for (int k = 0; k < B; k++) {
             const PackVector velocity = (next[k] - r[k]) * inverseDrift;
             multipliers[k] =
-                dot(velocity, velocity) * inverseSquareLength[k] + dot(factor.row[k], bondOf(acceleration, k));
+                dot(velocity, velocity) * shape.inverseSquareLength[k] + dot(factor.row[k], bondOf(acceleration, k));
             store(lanes, k, multipliers[k], step.rightSidePlus);
         }
         solve(factor, multipliers);
@@ -333,7 +367,7 @@ template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays
             store(lanes, k, multipliers[k], step.lambdaPlus);
             store(lanes, k, g[k] * inverseScale, step.change);
         }
-        addConstraintForces(factor, lambda, -kick, w);
+        addConstraintForces(shape, factor, lambda, -kick, w);
         for (int i = 0; i < P; i++) {
             store(lanes, i, w[i], step.wNext);
             store(lanes, i, q[i] + w[i] * drift, step.qNext);
@@ -347,30 +381,31 @@ template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& s
     double smallestPivot = std::numeric_limits<double>::infinity();
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
         const Lanes lanes = lanesOf(cluster, end);
+        const Shape& shape = shapeOf(cluster);
         PackVector q[P], w[P], v[P], acceleration[P], r[B];
         for (int i = 0; i < P; i++) {
             q[i] = load(lanes, i, step.q);
             w[i] = load(lanes, i, step.w);
-            acceleration[i] = load(lanes, i, step.force) * inverseMass[i];
+            acceleration[i] = load(lanes, i, step.force) * shape.inverseMass[i];
             v[i] = w[i] + acceleration[i] * kick;
         }
         for (int k = 0; k < B; k++)
             r[k] = bondOf(q, k);
         Factor factor;
-        factorize(r, factor);
-        keepSmallestPivot(factor, smallestPivot);
+        factorize(shape, r, factor);
+        keepSmallestPivot(shape, factor, smallestPivot);
         Pack x[B], applied[B], multipliers[B];
         for (int k = 0; k < B; k++) {
             x[k] = dot(factor.row[k], bondOf(v, k));
             applied[k] = dot(factor.row[k], bondOf(acceleration, k));
         }
         solve(factor, x);
-        addConstraintForces(factor, x, packOf(-1), v);
+        addConstraintForces(shape, factor, x, packOf(-1), v);
         for (int i = 0; i < P; i++)
             store(lanes, i, v[i], step.v);
         for (int k = 0; k < B; k++) {
             const PackVector velocity = bondOf(v, k);
-            multipliers[k] = dot(velocity, velocity) * inverseSquareLength[k] + applied[k];
+            multipliers[k] = dot(velocity, velocity) * shape.inverseSquareLength[k] + applied[k];
             store(lanes, k, multipliers[k], step.rightSide);
         }
         solve(factor, multipliers);
@@ -378,12 +413,12 @@ template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& s
             store(lanes, k, multipliers[k], step.lambda);
         if (step.lambdaHalf == nullptr)
             continue;
-        addConstraintForces(factor, multipliers, packOf(-1), acceleration);
+        addConstraintForces(shape, factor, multipliers, packOf(-1), acceleration);
         for (int k = 0; k < B; k++) {
             const PackVector velocity = bondOf(w, k);
-            x[k] = dot(velocity, velocity) * inverseSquareLength[k] + applied[k];
+            x[k] = dot(velocity, velocity) * shape.inverseSquareLength[k] + applied[k];
             store(lanes, k, x[k], step.rightSideHalf);
-            multipliers[k] = packOf(2) * dot(bondOf(v, k), bondOf(acceleration, k)) * inverseSquareLength[k];
+            multipliers[k] = packOf(2) * dot(bondOf(v, k), bondOf(acceleration, k)) * shape.inverseSquareLength[k];
         }
         solve(factor, x);
         solve(factor, multipliers);
@@ -430,7 +465,7 @@ void ClusterBatch::arrange(const vector<DistanceConstraint>& cluster, vector<int
     order.clear();
     particles = findParticles(cluster);
     if (particles.size() == 3 && cluster.size() == 3) {
-        // The particle of the two equal bonds first (the oxygen of a water), so that equal molecules make one batch.
+        // The particle of the two equal bonds first (the oxygen of a water), so that equal molecules have one shape.
         for (int centre = 0; centre < 3; centre++) {
             vector<double> lengths;
             for (const DistanceConstraint& c : cluster)
@@ -458,20 +493,19 @@ void ClusterBatch::arrange(const vector<DistanceConstraint>& cluster, vector<int
     }
 }
 
-std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<double>& inverseMasses,
-                                                   const vector<double>& lengths, const vector<int>& particles,
-                                                   int firstConstraint) {
+std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<ClusterShape>& clusters,
+                                                   const vector<int>& particles, int firstConstraint) {
     typedef std::unique_ptr<ClusterBatch> Result;
     if (isTriangle)
-        return Result(new BatchOf<Triangle>(inverseMasses, lengths, particles, firstConstraint));
+        return Result(new BatchOf<Triangle>(clusters, particles, firstConstraint));
     switch (numBonds) {
     case 1:
-        return Result(new BatchOf<Star<1>>(inverseMasses, lengths, particles, firstConstraint));
+        return Result(new BatchOf<Star<1>>(clusters, particles, firstConstraint));
     case 2:
-        return Result(new BatchOf<Star<2>>(inverseMasses, lengths, particles, firstConstraint));
+        return Result(new BatchOf<Star<2>>(clusters, particles, firstConstraint));
     case 3:
-        return Result(new BatchOf<Star<3>>(inverseMasses, lengths, particles, firstConstraint));
+        return Result(new BatchOf<Star<3>>(clusters, particles, firstConstraint));
     default:
-        return Result(new BatchOf<Star<4>>(inverseMasses, lengths, particles, firstConstraint));
+        return Result(new BatchOf<Star<4>>(clusters, particles, firstConstraint));
     }
 }

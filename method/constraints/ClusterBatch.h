@@ -7,6 +7,7 @@
 #include "constraints/ConstraintSystem.h"
 #include "openmm/Vec3.h"
 #include <memory>
+#include <tuple>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -42,9 +43,17 @@ struct OnStepArrays {
     double kick; // of (3.12), h/(2 rho)
 };
 
+/** What clusters of one topology may differ in. */
+struct ClusterShape {
+    std::vector<double> inverseMasses; // 1/mass of each particle
+    std::vector<double> lengths;       // of each constraint
+    bool operator<(const ClusterShape& other) const {
+        return std::tie(inverseMasses, lengths) < std::tie(other.inverseMasses, other.lengths);
+    }
+};
+
 /**
- * Small clusters of one shape: the same topology, masses and lengths, such as all the waters of a box or all CH2 groups
- * with the same bond length. All arithmetic of a step on a cluster is done in one pass, in registers, on PACK_SIZE
+ * Small clusters of one topology, such as all the waters of a box or all CH2 groups; their masses and lengths may differ. All arithmetic of a step on a cluster is done in one pass, in registers, on PACK_SIZE
  * clusters at a time; nothing is kept between passes but the multipliers.
  */
 class ClusterBatch {
@@ -101,14 +110,13 @@ public:
      *
      * @param numBonds           the number of constraints in a cluster
      * @param isTriangle         whether the three particles of a cluster are all joined
-     * @param inverseMasses      1/mass of each particle of a cluster
-     * @param lengths            the length of each of its constraints
+     * @param clusters           masses and lengths of each cluster
      * @param particles          the particles, cluster after cluster
      * @param firstConstraint    the first constraint of the batch in the internal order; the others follow, cluster after cluster
      */
-    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle, const std::vector<double>& inverseMasses,
-                                                const std::vector<double>& lengths, const std::vector<int>& particles,
-                                                int firstConstraint);
+    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle,
+                                                const std::vector<ClusterShape>& clusters,
+                                                const std::vector<int>& particles, int firstConstraint);
 };
 
 } // namespace OpenMMVRattle

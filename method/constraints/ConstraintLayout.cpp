@@ -10,6 +10,7 @@
 #include <map>
 #include <numeric>
 #include <set>
+#include <stdexcept>
 #include <tuple>
 
 using namespace OpenMMVRattle;
@@ -35,20 +36,17 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
     const Given given = {distances, expressions};
     for (size_t i = 0; i < masses.size(); i++)
         inverseMasses[i] = masses[i] > 0 ? 1.0 / masses[i] : 0.0;
+    for (const DistanceConstraint& c : distances)
+        if ((inverseMasses[c.particle1] == 0) != (inverseMasses[c.particle2] == 0))
+            throw std::invalid_argument("a distance constraint involves a particle whose mass is zero, " +
+                                        std::to_string(inverseMasses[c.particle1] == 0 ? c.particle1 : c.particle2));
 
-    // Small clusters with the same topology, masses and lengths make a batch; the others are general.
-    struct Shape {
-        vector<double> inverseMasses, lengths;
-        size_t numParticles;
-        bool operator<(const Shape& other) const {
-            return std::tie(numParticles, inverseMasses, lengths) <
-                   std::tie(other.numParticles, other.inverseMasses, other.lengths);
-        }
-    };
+    // Small clusters with the same topology make a batch; the others are general.
     struct Member {
         vector<int> constraints, particles;
+        ClusterShape shape;
     };
-    std::map<Shape, vector<Member>> shapes;
+    std::map<std::pair<int, int>, vector<Member>> topologies; // by the numbers of constraints and of particles
     vector<GeneralCluster> general;
     vector<char> isInBatch(masses.size(), false);
     vector<int> all(given.getSize());
@@ -57,7 +55,7 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
         vector<DistanceConstraint> members;
         bool mayBeInBatch = true;
         for (int k : cluster) {
-            mayBeInBatch = mayBeInBatch && !given.isExpression(k) && findMovingParticles(given, k).size() == 2;
+            mayBeInBatch = mayBeInBatch && !given.isExpression(k);
             if (mayBeInBatch)
                 members.push_back(distances[k]);
         }
@@ -65,34 +63,34 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
             general.push_back(cutAndOrder(given, cluster));
             continue;
         }
-        vector<int> order, particles, arranged;
-        ClusterBatch::arrange(members, order, particles);
-        Shape shape;
-        shape.numParticles = particles.size();
+        vector<int> order;
+        Member member;
+        ClusterBatch::arrange(members, order, member.particles);
         for (int k : order) {
-            arranged.push_back(cluster[k]);
-            shape.lengths.push_back(members[k].length);
+            member.constraints.push_back(cluster[k]);
+            member.shape.lengths.push_back(members[k].length);
         }
-        for (int i : particles) {
+        for (int i : member.particles) {
             isInBatch[i] = true;
-            shape.inverseMasses.push_back(inverseMasses[i]);
+            member.shape.inverseMasses.push_back(inverseMasses[i]);
         }
-        shapes[shape].push_back({arranged, particles});
+        topologies[{(int) order.size(), (int) member.particles.size()}].push_back(std::move(member));
     }
-    for (auto& entry : shapes) {
-        const Shape& shape = entry.first;
+    for (auto& entry : topologies) {
+        const int numBonds = entry.first.first, numParticles = entry.first.second;
         vector<Member>& members = entry.second;
         std::sort(members.begin(), members.end(),
                   [](const Member& a, const Member& b) { return a.particles[0] < b.particles[0]; });
-        const int first = (int) constraints.size(), numBonds = (int) shape.lengths.size();
+        const int first = (int) constraints.size();
         vector<int> particles;
+        vector<ClusterShape> shapes;
         for (const Member& member : members) {
             clusters.push_back({(int) constraints.size(), numBonds});
             append(given, member.constraints);
             particles.insert(particles.end(), member.particles.begin(), member.particles.end());
+            shapes.push_back(member.shape);
         }
-        batches.push_back(ClusterBatch::create(numBonds, numBonds == 3 && shape.numParticles == 3, shape.inverseMasses,
-                                               shape.lengths, particles, first));
+        batches.push_back(ClusterBatch::create(numBonds, numBonds == 3 && numParticles == 3, shapes, particles, first));
     }
     firstGeneral = (int) constraints.size();
     auto isDistance = [&](int k) { return !given.isExpression(k); };
@@ -118,10 +116,6 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
     findCouplings();
     findFreeParticles(isInBatch);
     findBlocks();
-    isFreeToTranslate =
-        expressions.empty() && std::all_of(constraints.begin(), constraints.end(), [&](const DistanceConstraint& c) {
-            return inverseMasses[c.particle1] > 0 && inverseMasses[c.particle2] > 0;
-        });
     for (int k = 0; k < getNumConstraints(); k++) {
         const double length = constraints[k].length;
         inverseSquareLengths.push_back(1.0 / (length * length));
@@ -142,10 +136,8 @@ vector<int> ConstraintSystem::findMovingParticles(const Given& given, int k) con
         for (int i : given.getExpression(k).particles)
             addIfMoving(i);
     }
-    else {
-        addIfMoving(given.distances[k].particle1);
-        addIfMoving(given.distances[k].particle2);
-    }
+    else if (inverseMasses[given.distances[k].particle1] > 0)
+        result = {given.distances[k].particle1, given.distances[k].particle2};
     return result;
 }
 
@@ -304,7 +296,7 @@ vector<int> ConstraintSystem::walkThroughParticles(const Given& given, const vec
         for (size_t next = 0; next < queue.size(); next++)
             for (int k : constraintsOf.at(queue[next])) {
                 int i = other(k, queue[next]);
-                if (inverseMasses[i] > 0 && origin.emplace(i, queue[next]).second)
+                if (origin.emplace(i, queue[next]).second)
                     queue.push_back(i);
             }
         return queue.back();
@@ -323,22 +315,22 @@ vector<int> ConstraintSystem::walkThroughParticles(const Given& given, const vec
     };
     std::set<int> seen = {root}, placed, treeConstraints;
     vector<int> order;
-    auto isRingOrAnchor = [&](int k) { return treeConstraints.count(k) == 0; };
+    auto closesRing = [&](int k) { return treeConstraints.count(k) == 0; };
     vector<Place> path = {{root, -1, 0}};
     while (!path.empty()) {
         Place& place = path.back();
         const vector<int>& list = constraintsOf.at(place.particle);
         if (place.next < list.size()) {
             const int k = list[place.next++], i = other(k, place.particle);
-            if (inverseMasses[i] > 0 && seen.insert(i).second) {
+            if (seen.insert(i).second) {
                 treeConstraints.insert(k);
                 path.push_back({i, k, 0});
             }
             continue;
         }
-        // Leaving a particle, with all that lies behind it placed: what is left here closes a ring, or holds an anchor.
+        // Leaving a particle, with all that lies behind it placed: what is left here closes a ring.
         for (int k : list)
-            if (isRingOrAnchor(k) && placed.insert(k).second)
+            if (closesRing(k) && placed.insert(k).second)
                 order.push_back(k);
         if (place.arrivedBy >= 0 && placed.insert(place.arrivedBy).second)
             order.push_back(place.arrivedBy);
@@ -389,7 +381,8 @@ void ConstraintSystem::groupExpressions(const Given& given) {
         const int e = givenIndex[k] - numGivenDistances, firstEntry = getNumEntries();
         const ExpressionConstraint& c = given.getExpression(givenIndex[k]);
         for (int i : c.particles)
-            expressionEntries.push_back({k, i});
+            if (inverseMasses[i] > 0)
+                expressionEntries.push_back({k, i});
         expressionRows.push_back({k, firstEntry, getNumEntries()});
         vector<std::string> names;
         for (const auto& parameter : c.parameters)
@@ -493,10 +486,7 @@ void ConstraintSystem::findJointEnds() {
         for (int p = piece.firstParticle; p < piece.endParticle; p++)
             pieceOf[generalParticles[p]] = piece.piece;
     vector<vector<JointEnd>> endsOf(pieces.size());
-    auto add = [&](const JointEnd& end) {
-        if (inverseMasses[end.particle] > 0)
-            endsOf[pieceOf[end.particle]].push_back(end);
-    };
+    auto add = [&](const JointEnd& end) { endsOf[pieceOf[end.particle]].push_back(end); };
     for (const CutCluster& cut : cutClusters) {
         for (int k = cut.joints.first; k < cut.joints.end; k++)
             if (!isExpression(k)) {
@@ -540,10 +530,7 @@ void ConstraintSystem::findCouplings() {
         int entry, sign;
     };
     vector<vector<End>> ends(masses.size());
-    auto addEnd = [&](int particle, int entry, int sign) {
-        if (inverseMasses[particle] > 0)
-            ends[particle].push_back({entry, sign});
-    };
+    auto addEnd = [&](int particle, int entry, int sign) { ends[particle].push_back({entry, sign}); };
     for (int k = 0; k < getNumConstraints(); k++) {
         if (isExpression(k))
             continue;
@@ -554,8 +541,7 @@ void ConstraintSystem::findCouplings() {
     }
     for (size_t e = 0; e < expressionEntries.size(); e++) {
         const int entry = getNumConstraints() + (int) e, particle = expressionEntries[e].particle;
-        if (inverseMasses[particle] > 0)
-            couplings.push_back({entry, entry, inverseMasses[particle]});
+        couplings.push_back({entry, entry, inverseMasses[particle]});
         addEnd(particle, entry, 1);
     }
     for (size_t p = 0; p < ends.size(); p++)

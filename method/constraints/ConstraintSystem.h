@@ -35,16 +35,18 @@ struct DistanceConstraint {
  * it is the same for g and for 1000 g, and one tolerance serves these constraints too.
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
- * neighbours: first the small clusters that come in batches of one shape, then the general ones, and of these the ones
+ * neighbours: first the small clusters that come in batches of one topology, then the general ones, and of these the ones
  * with an expression last. The functions below work on a part of them: all, one of getGeneralParts(), one of getPieces() of
- * the large clusters, or the joints between these. Distance constraints between two particles of mass zero cannot move
- * anything and are left out.
+ * the large clusters, or the joints between these.
+ *
+ * A particle of mass zero does not move. Only expressions may depend on it; it has no entry in G, and no function below that
+ * moves particles writes to it.
  */
 class ConstraintSystem {
 public:
     /**
      * The rows of G, of length getNumEntries(). A distance constraint has one entry, its place in the internal order: the part
-     * of its row that acts on particle 1, 1/nm. The rows of expressions lie behind, an entry for each particle.
+     * of its row that acts on particle 1, 1/nm. The rows of expressions lie behind, an entry for each particle with mass.
      */
     typedef std::vector<OpenMM::Vec3> Jacobian;
     /**
@@ -107,7 +109,7 @@ public:
 
     /**
      * @param masses         the mass of each particle (amu); 0 for a particle that does not move
-     * @param constraints    the distance constraints
+     * @param constraints    the distance constraints; one between two particles of mass zero is left out, as in OpenMM
      * @param expressions    the constraints given as expressions, of at least one particle with mass each
      */
     ConstraintSystem(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
@@ -198,9 +200,9 @@ public:
     const std::vector<int>& getFreeParticles() const {
         return freeParticles;
     }
-    /** Whether a motion of all particles with mass at one velocity satisfies the constraints: none holds a fixed particle. */
+    /** Whether a motion of all particles with mass at one velocity is known to satisfy the constraints. */
     bool isTranslationInvariant() const {
-        return isFreeToTranslate;
+        return expressions.empty();
     }
     /** The particles of a cluster, in increasing order. */
     std::vector<int> getClusterParticles(int cluster) const;
@@ -308,7 +310,6 @@ private:
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
-    bool isFreeToTranslate;
     std::vector<double> masses, inverseMasses;
     std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning
     std::vector<int> givenIndex;                 // internal order -> order of the constructor

@@ -35,10 +35,9 @@ ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParti
 void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int firstEntry,
                           const vector<double>& inverseMasses) {
     indices.push_back(index);
-    firstEntries.push_back(firstEntry);
     for (int i : constraint.particles) {
         particles.push_back(i);
-        isMoving.push_back(inverseMasses[i] > 0);
+        entries.push_back(inverseMasses[i] > 0 ? firstEntry++ : NO_ENTRY);
     }
     parameterValues.resize(parameterValues.size() + parameters.size());
     setParameters(getNumConstraints() - 1, constraint.parameters);
@@ -84,7 +83,7 @@ void ExpressionGroup::run(const ArrayExpression& program, const Range& range, co
     for (int first = range.first; first < range.end; first += MAX_BLOCK_SIZE) {
         const int count = std::min(MAX_BLOCK_SIZE, range.end - first);
         const int* block = &particles[(size_t) first * numParticles];
-        const char* moving = &isMoving[(size_t) first * numParticles];
+        const int* blockEntries = &entries[(size_t) first * numParticles];
         for (int p = 0; p < numParticles; p++) {
             double* x[3];
             if (findInputs(3 * p, x))
@@ -98,7 +97,7 @@ void ExpressionGroup::run(const ArrayExpression& program, const Range& range, co
             if (findInputs(numCoordinates + 3 * p, x))
                 for (int n = 0; n < count; n++) {
                     const int place = n * numParticles + p;
-                    const Vec3 velocity = moving[place] ? (*range.v)[block[place]] : Vec3();
+                    const Vec3 velocity = blockEntries[place] != NO_ENTRY ? (*range.v)[block[place]] : Vec3();
                     x[0][n] = velocity[0];
                     x[1][n] = velocity[1];
                     x[2][n] = velocity[2];
@@ -128,9 +127,11 @@ void ExpressionGroup::runRows(const ArrayExpression& program, const Range& range
         for (int i = 0; i < numParticles; i++) {
             const double *x = program.getOutput(work, 3 * i), *y = program.getOutput(work, 3 * i + 1),
                          *z = program.getOutput(work, 3 * i + 2);
-            for (int n = 0; n < count; n++)
-                jacobian[firstEntries[first + n] + i] =
-                    isMoving[(size_t) (first + n) * numParticles + i] ? Vec3(x[n], y[n], z[n]) : Vec3();
+            for (int n = 0; n < count; n++) {
+                const int entry = entries[(size_t) (first + n) * numParticles + i];
+                if (entry != NO_ENTRY)
+                    jacobian[entry] = Vec3(x[n], y[n], z[n]);
+            }
         }
     });
 }

@@ -27,8 +27,7 @@ struct ExpressionConstraint {
  * and differentiated once, and evaluated for those that were added as the first-th, ..., (end - 1)-th together. Several threads may
  * evaluate different ones at the same time.
  *
- * A constraint of n particles has n neighbouring entries in a Jacobian, one for each particle in the constraint's order. Those
- * of particles without mass are zero.
+ * A constraint has neighbouring entries in a Jacobian, one for each particle with mass, in the constraint's order.
  */
 class ExpressionGroup {
 public:
@@ -66,7 +65,7 @@ private:
      * How many constraints are evaluated at once: enough to pay for going through the operations, and few enough that what they
      * work on stays in the processor's nearest memory.
      */
-    static constexpr int MAX_BLOCK_SIZE = 64;
+    static constexpr int MAX_BLOCK_SIZE = 64, NO_ENTRY = -1;
     typedef std::unique_ptr<ArrayExpression> Program;
     /** What a program works on: positions, perhaps velocities, and the constraints first, ..., end - 1. */
     struct Range {
@@ -85,9 +84,8 @@ private:
     std::vector<std::string> parameterNames;
     int value, rate, curvature; // nodes: g, its derivative along v, and the derivative of this along v
     Program valueProgram, jacobianProgram, curvatureProgram, velocityJacobianProgram; // made when they are first needed
-    std::vector<int> indices, firstEntries, particles;
+    std::vector<int> indices, particles, entries; // NO_ENTRY for a particle without mass
     std::vector<double> parameterValues;
-    std::vector<char> isMoving; // as particles
     std::mutex mutex; // of the making of programs
 };
 

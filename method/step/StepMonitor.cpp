@@ -198,7 +198,8 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
             break;
         case VectorField:
             for (int p = 0; p < numParticles; p++)
-                sum += system.getMasses()[p] * v[p].dot(velocityRate[p]);
+                if (system.getMasses()[p] > 0)
+                    sum += system.getMasses()[p] * v[p].dot(velocityRate[p]);
             rate += factor * sum / value;
             break;
         case ArcLength:
@@ -240,7 +241,8 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
     case ForcePNorm:
         return forcePNorm;
     case VectorField: // (4.1)
-        return std::sqrt(forceSquared + sumOf(numParticles, [&](int i) { return masses[i] * v[i].dot(v[i]); }));
+        return std::sqrt(forceSquared +
+                         sumOf(numParticles, [&](int i) { return masses[i] > 0 ? masses[i] * v[i].dot(v[i]) : 0.0; }));
     case MaxForce:
         return maxForce;
     case ArcLength:
@@ -285,8 +287,6 @@ bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v,
         double product = 0, square = 0; // G M^-1 F without cancellation, and the diagonal of K
         for (int entry = row.first; entry < row.end; entry++) {
             const int i = system.getParticleOf(entry);
-            if (inverseMasses[i] == 0)
-                continue;
             const double rowSquared = jacobian[entry].dot(jacobian[entry]);
             product += std::sqrt(rowSquared) * forceOn(i, ConstraintSystem::EXPRESSION_LENGTH) * inverseMasses[i];
             square += rowSquared * inverseMasses[i];
@@ -348,7 +348,8 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& q, const vector<Vec3>& v,
             break;
         case VectorField:
             for (int p = 0; p < numParticles; p++)
-                gradient[p] += v[p] * (factor / value * masses[p]);
+                if (masses[p] > 0)
+                    gradient[p] += v[p] * (factor / value * masses[p]);
             break;
         case ArcLength:
             for (int p = 0; p < numParticles; p++)

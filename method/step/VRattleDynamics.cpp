@@ -432,7 +432,7 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
     if (!isSolved)
         return false;
     double product = 0, square = 0;
-    for (int i = 0; i < system.getNumParticles(); i++) {
+    for (int i : movingParticles) {
         Vec3 forward = qNext[i] - q[i];
         product += system.getMasses()[i] * forward.dot(qBack[i] - q[i]);
         square += system.getMasses()[i] * forward.dot(forward);

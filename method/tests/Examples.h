@@ -55,8 +55,8 @@ struct Example {
 };
 
 /**
- * A backbone held by an anchor at one end, a side group at each third particle and a triangle at each seventh, beside some waters
- * and free particles. The constraints stand in no order.
+ * A backbone that an expression holds to a fixed particle at one end, a side group at each third particle and a triangle at
+ * each seventh, beside some waters and free particles. The constraints stand in no order.
  */
 inline Example makeComb(int backbone) {
     using OpenMM::Vec3;
@@ -65,7 +65,11 @@ inline Example makeComb(int backbone) {
     for (int i = 1; i < backbone; i++) {
         const Vec3 place = Vec3(0.12 * i, 0.05 * (i % 2), 0) + e.randomVector(0.03);
         const int next = e.add(e.uniform(10, 40), place);
-        e.join(last, next);
+        if (i == 1)
+            e.expressions.push_back(
+                {"(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-square", {last, next}, {{"square", place.dot(place)}}});
+        else
+            e.join(last, next);
         if (i % 3 == 0)
             e.join(next, e.add(1, place + Vec3(0, 0.1, 0.03)));
         if (i % 7 == 0) {

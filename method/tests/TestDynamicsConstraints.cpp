@@ -6,8 +6,10 @@
 #include "TestSupport.h"
 #include "constraints/ConstraintMatrix.h"
 #include "constraints/NewtonMatrix.h"
+#include "step/VRattleDynamics.h"
 #include <Eigen/Dense>
 #include <random>
+#include <string>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -168,15 +170,91 @@ void testNewtonMatrixAgainstDense(int chainLength) {
 }
 
 void testMasslessParticles() {
-    // An anchor of mass zero is allowed by the method; a constraint between two of them is left out.
-    vector<double> masses = {0, 2, 0};
-    ConstraintSystem system(masses, {{0, 1, 1.0}, {0, 2, 1.0}});
-    ASSERT_EQUAL(1, system.getNumConstraints());
-    ASSERT_EQUAL(2, system.getNumGivenConstraints());
+    // As in OpenMM, a distance to what cannot move is refused, and one between two such particles is none.
+    assertThrows("mass is zero, 2", [] { ConstraintSystem({1, 2, 0}, {{0, 1, 1.0}, {1, 2, 1.0}}); });
+    const ConstraintSystem one({0, 2, 0, 1}, {{1, 3, 1.0}, {0, 2, 1.0}});
+    ASSERT_EQUAL(1, one.getNumConstraints());
+    ASSERT_EQUAL(2, one.getNumGivenConstraints());
     vector<double> multipliers;
-    system.getGivenMultipliers({3.0}, multipliers);
+    one.getGivenMultipliers({3.0}, multipliers);
     ASSERT_EQUAL_TOL(1.5, multipliers[0], 1e-15);
     ASSERT_EQUAL(0.0, multipliers[1]);
+    // Expressions may hold a particle to it. It is never written to: a NaN from a trial stays a trial's, and threads that
+    // share an anchor do not meet at it.
+    const std::string distance = "(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-1";
+    const ConstraintSystem system({0, 2, 3}, {}, {{distance, {0, 1}, {}}, {distance, {2, 0}, {}}});
+    ASSERT_EQUAL(2 + 2, system.getNumEntries());
+    const vector<Vec3> positions = {Vec3(), Vec3(1, 0, 0), Vec3(0, 1, 0)};
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    system.evaluateJacobian(positions, jacobian);
+    const double nan = std::nan("");
+    vector<Vec3> x(3, Vec3(5, 6, 7));
+    system.addTransposedOverMass(jacobian, {nan, nan}, 1.0, x);
+    ASSERT_EQUAL_VEC(Vec3(5, 6, 7), x[0], 0.0);
+    ASSERT(std::isnan(x[1][0]) && std::isnan(x[2][1]));
+    system.addTransposed(jacobian, {nan, nan}, x);
+    ASSERT_EQUAL_VEC(Vec3(5, 6, 7), x[0], 0.0);
+    // Nor read where it would count as moving.
+    const vector<Vec3> velocities = {Vec3(nan, nan, nan), Vec3(1, 2, 3), Vec3(1, 2, 3)};
+    vector<double> result(2);
+    system.multiply(jacobian, velocities, result);
+    ASSERT_EQUAL_TOL(2.0, result[0], 1e-15);
+    ASSERT_EQUAL_TOL(4.0, result[1], 1e-15);
+    system.multiplyOverMass(jacobian, velocities, result);
+    ASSERT_EQUAL_TOL(1.0, result[0], 1e-15);
+    ASSERT_EQUAL_TOL(4.0 / 3, result[1], 1e-15);
+}
+
+// Lengths and masses are data of each cluster: clusters of one topology make one batch, and are solved with their own.
+void testClustersOfDifferentLengths() {
+    Example e;
+    std::mt19937 random(3);
+    std::uniform_real_distribution<double> uniform(1, 150);
+    auto addMolecule = [&](const vector<std::pair<int, int>>& bonds, int size) {
+        const int first = (int) e.masses.size();
+        for (int i = 0; i < size; i++) {
+            e.masses.push_back(uniform(random));
+            e.positions.push_back(randomVector(random));
+            e.velocities.push_back(randomVector(random));
+        }
+        for (const auto& bond : bonds) {
+            const Vec3 r = e.positions[first + bond.first] - e.positions[first + bond.second];
+            e.constraints.push_back({first + bond.first, first + bond.second, std::sqrt(r.dot(r))});
+        }
+    };
+    for (int i = 0; i < 7; i++) {
+        addMolecule({{0, 1}}, 2);
+        addMolecule({{0, 1}, {0, 2}, {1, 2}}, 3);
+        addMolecule({{0, 1}, {0, 2}, {0, 3}}, 4);
+    }
+    VRattleDynamics dynamics(e.masses, e.constraints);
+    const ConstraintSystem& system = dynamics.getConstraintSystem();
+    const int m = system.getNumConstraints();
+    ASSERT_EQUAL(3, (int) system.getBatches().size());
+    ASSERT_EQUAL(m, system.getFirstGeneral());
+    dynamics.setSettings(
+        {1e-3, 0, 0, 1e-10, StepDensity::SemiExplicit, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false});
+    vector<Vec3> forces(e.masses.size());
+    for (Vec3& force : forces)
+        force = randomVector(random);
+    dynamics.begin(e.positions, e.velocities, forces, 0);
+    vector<double> g(m), curvature(m);
+    ConstraintSystem::Jacobian jacobian(system.getNumEntries());
+    for (int step = 0; step < 5; step++) {
+        dynamics.step(INFINITY);
+        ASSERT(system.evaluate(dynamics.getNextPositions(), g, jacobian) <= 1e-10);
+        vector<Vec3> sameForces = forces;
+        ASSERT(dynamics.finish(sameForces, 0));
+        const Eigen::MatrixXd rows = denseJacobian(system, dynamics.getPositions());
+        const Eigen::VectorXd inverseMasses = denseInverseMasses(e.masses);
+        assertSmall((rows * flatten(dynamics.getVelocities())).norm(), 1e-10);
+        system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), curvature);
+        const Eigen::VectorXd right =
+            Eigen::VectorXd::Map(curvature.data(), m) + rows * inverseMasses.asDiagonal() * flatten(forces);
+        const Eigen::VectorXd expected = (rows * inverseMasses.asDiagonal() * rows.transpose()).ldlt().solve(right);
+        assertSmall((expected - Eigen::VectorXd::Map(dynamics.getMultipliers().data(), m)).norm(),
+                    1e-9 * expected.norm());
+    }
 }
 
 static void assertDependent(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
@@ -217,6 +295,7 @@ int main() {
         {"Newton's matrix, dense blocks", [] { testNewtonMatrixAgainstDense(5); }},
         {"Newton's matrix, with a sparse block", [] { testNewtonMatrixAgainstDense(60); }},
         {"massless particles", testMasslessParticles},
+        {"clusters of different lengths and masses", testClustersOfDifferentLengths},
         {"dependent constraints are named", testDependentConstraints},
     });
 }

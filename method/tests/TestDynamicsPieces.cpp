@@ -263,11 +263,11 @@ void testThreads(const Example& e) {
 
 // A doubled bond is found within a piece and among the joints.
 void testDependentConstraints(const Example& e) {
-    const ConstraintSystem whole(e.masses, e.distances);
+    const ConstraintSystem whole(e.masses, e.distances, e.expressions);
     for (int k : {whole.getPieces()[1].first, whole.getCutClusters()[0].joints.first}) {
         vector<DistanceConstraint> distances = e.distances;
         distances.push_back(whole.getConstraint(k));
-        VRattleDynamics dynamics(e.masses, distances);
+        VRattleDynamics dynamics(e.masses, distances, e.expressions);
         ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
         dynamics.setSettings(makeSettings(StepDensity::Explicit));
         assertThrows("redundant", [&] { dynamics.begin(e.positions, e.velocities, vector<Vec3>(e.masses.size()), 0); });
