@@ -91,7 +91,6 @@ int main(int argc, char** argv) {
     settings.tolerance = 1e-8;
     settings.update = update;
     settings.terms = {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}};
-    settings.normOrder = 8;
     dynamics.setSettings(settings);
     vector<Vec3> forces(masses.size());
     dynamics.begin(positions, velocities, forces, 0);

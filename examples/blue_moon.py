@@ -77,7 +77,7 @@ def scan(copies: int = 200, windows: int = 40, seed: int = 1) -> list[MeanForce]
     results = []
     for n, distance in enumerate(DISTANCES):
         for copy in range(copies):
-            integrator.setExpressionConstraintParameter(copy, "distance", distance)
+            integrator.setExpressionParameterValue(copy, "distance", distance)
         samples = []
         for window in range(windows):
             # OpenMM knows nothing of our constraints; the integrator makes these velocities tangent, in the metric of

@@ -230,8 +230,8 @@ Kinds of monitor, for addMonitor(). F is the applied force, v the velocity, m th
  - ConstraintForce: the mass-weighted constraint force sqrt(Lambda^T K Lambda) of Gauss's principle, in nm amu^(1/2)/ps^2.
  - AppliedForce: the mass-weighted applied force sqrt(sum |F|^2/m), in nm amu^(1/2)/ps^2.
  - ConstraintAndAppliedForce: sqrt(Lambda^T K Lambda + sum |F|^2/m), in nm amu^(1/2)/ps^2.
- - MultiplierPNorm: the p-norm of the multipliers, in kJ/mol/nm^2; see setNormOrder().
- - ForcePNorm: the p-norm over the particles of |F|, in kJ/mol/nm; see setNormOrder().
+ - MultiplierPNorm: the p-norm of the multipliers, in kJ/mol/nm^2; see addMonitor().
+ - ForcePNorm: the p-norm over the particles of |F|, in kJ/mol/nm; see addMonitor().
  - VectorField: U1 (4.1), sqrt(sum m |v|^2 + sum |F|^2), in OpenMM's units.
  - MaxForce: the largest |F| of any particle, in kJ/mol/nm.
  - ArcLength: the speed along the unconstrained trajectory in phase space, sqrt(sum |v|^2 + sum |F|^2).
@@ -488,7 +488,7 @@ def setUpdateMethod(self, method: int) -> None:
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::addMonitor %{
-def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0) -> int:
+def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0, order: float = 0.0) -> int:
     r"""
     Add a monitor. Several monitors are combined, each relative to its own reference value, as
     u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2).
@@ -501,6 +501,9 @@ def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0) -> int:
         its weight w_k > 0 in the combination; of no effect on a single monitor
     power : float
         the positive power to which U_k/U_k,ref is raised
+    order : float
+        the order p, at least 1, of MultiplierPNorm and ForcePNorm; of no meaning to others. 0 stands for getNormOrder(),
+        which is 8
 
     Returns
     -------
@@ -510,9 +513,29 @@ def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0) -> int:
     Raises
     ------
     OpenMMException
-        if there is no such kind, or weight or power is not a positive finite number
+        if there is no such kind, or weight or power is not a positive finite number, or order is below 1
     """
-    return $action(self, _integer(kind, "kind"), _number(weight, "weight"), _number(power, "power"))
+    return $action(
+        self, _integer(kind, "kind"), _number(weight, "weight"), _number(power, "power"), _number(order, "order")
+    )
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getMonitorNormOrder %{
+def getMonitorNormOrder(self, index: int) -> float:
+    r"""
+    Get the order p of a monitor, which is that of a norm if it is MultiplierPNorm or ForcePNorm.
+
+    Parameters
+    ----------
+    index : int
+        the index of the monitor
+
+    Returns
+    -------
+    float
+        the order
+    """
+    return $action(self, _integer(index, "index"))
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::clearMonitors %{
@@ -654,7 +677,7 @@ def getCalibrationSteps(self) -> int:
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNormOrder %{
 def getNormOrder(self) -> float:
     r"""
-    Get the order p of the monitors MultiplierPNorm and ForcePNorm.
+    Get the order that addMonitor() gives to monitors that are added without one. Deprecated: use getMonitorNormOrder().
 
     Returns
     -------
@@ -667,7 +690,8 @@ def getNormOrder(self) -> float:
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setNormOrder %{
 def setNormOrder(self, order: float) -> None:
     r"""
-    Set the order p of the monitors MultiplierPNorm and ForcePNorm.
+    Set the order p of all monitors MultiplierPNorm and ForcePNorm, also of those that are added later without one.
+    Deprecated: give it to addMonitor().
 
     Parameters
     ----------
@@ -846,8 +870,8 @@ def getNumExpressionConstraints(self) -> int:
     return $action(self)
 %}
 
-%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setExpressionConstraintParameter %{
-def setExpressionConstraintParameter(self, index: int, name: str, value: float | unit.Quantity) -> None:
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setExpressionParameterValue %{
+def setExpressionParameterValue(self, index: int, name: str, value: float | unit.Quantity) -> None:
     r"""
     Change the value of one parameter of a constraint. It is in force at the next step, which starts the run afresh from
     positions that satisfy the constraint.
@@ -867,6 +891,23 @@ def setExpressionConstraintParameter(self, index: int, name: str, value: float |
         if there is no constraint with this index, or it has no such parameter, or the value is not finite
     """
     $action(self, _integer(index, "index"), name, _parameter(value, name))
+%}
+
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setExpressionConstraintParameter %{
+def setExpressionConstraintParameter(self, index: int, name: str, value: float | unit.Quantity) -> None:
+    r"""
+    The same as setExpressionParameterValue(). Deprecated: the name is too much like setExpressionConstraintParameters().
+
+    Parameters
+    ----------
+    index : int
+        the index of the constraint
+    name : str
+        the name of the parameter
+    value : float or Quantity
+        its new value
+    """
+    self.setExpressionParameterValue(index, name, value)
 %}
 
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getNumForceEvaluations %{
@@ -1019,7 +1060,7 @@ public:
     void setMaximumStepSize(double size);
     UpdateMethod getUpdateMethod() const;
     void setUpdateMethod(UpdateMethod method);
-    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0);
+    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0, double order = 0.0);
     void clearMonitors();
     int getNumMonitors() const;
     %apply int& OUTPUT { MonitorKind& kind };
@@ -1029,6 +1070,7 @@ public:
     %clear MonitorKind& kind;
     %clear double& weight;
     %clear double& power;
+    double getMonitorNormOrder(int index) const;
     void useAutomaticStepControl(int calibrationSteps = 300);
     bool isAutomatic() const;
     int getCalibrationSteps() const;
@@ -1044,6 +1086,7 @@ public:
     std::vector<double> getMultipliers() const;
     double getExpressionConstraintMultiplier(int index) const;
     int getNumExpressionConstraints() const;
+    void setExpressionParameterValue(int index, const std::string& name, double value);
     void setExpressionConstraintParameter(int index, const std::string& name, double value);
     long long getNumForceEvaluations() const;
     long long getNumSolverIterations() const;

@@ -134,16 +134,17 @@ inline void testSettings() {
     ASSERT_EQUAL(1, integrator.getNumMonitors());
     ASSERT_EQUAL(0.0, integrator.getReferenceMonitorValue());
     const double nan = std::numeric_limits<double>::quiet_NaN(), inf = std::numeric_limits<double>::infinity();
-    for (double bad : {0.0, -0.001, nan, inf}) {
+    for (double bad : {-0.001, nan, inf}) {
         assertThrows("step size", [&] { VariableStepRattleIntegrator bad_(bad); });
         assertThrows("step size", [&] { integrator.setNominalStepSize(bad); });
+        assertThrows("minimum step size", [&] { integrator.setMinimumStepSize(bad); });
+        assertThrows("maximum step size", [&] { integrator.setMaximumStepSize(bad); });
+    }
+    for (double bad : {0.0, -0.001, nan, inf}) {
         assertThrows("tolerance", [&] { integrator.setConstraintTolerance(bad); });
         assertThrows("weight", [&] { integrator.addMonitor(Integrator_::MaxForce, bad); });
         assertThrows("power", [&] { integrator.addMonitor(Integrator_::MaxForce, 1.0, bad); });
     }
-    assertThrows("smaller than the nominal", [&] { integrator.setMinimumStepSize(0.001); });
-    assertThrows("larger than the nominal", [&] { integrator.setMaximumStepSize(0.001); });
-    assertThrows("minimum", [&] { integrator.setMinimumStepSize(-1e-5); });
     assertThrows("no monitor with index 1", [&] { integrator.getReferenceMonitorValue(1); });
     assertThrows("reference", [&] { integrator.setReferenceMonitorValue(-1); });
     assertThrows("order", [&] { integrator.setNormOrder(0.5); });
@@ -401,6 +402,8 @@ inline void testBadSystems() {
     System free;
     free.addParticle(1);
     VariableStepRattleIntegrator noConstraints(0.001);
+    noConstraints.clearMonitors();
+    noConstraints.addMonitor(Integrator_::ConstraintMultipliers);
     assertThrows("has no constraints", [&] { Context context(free, noConstraints, getTestPlatform()); });
 
     // Nothing pulls at the start, so the multipliers are no measure.

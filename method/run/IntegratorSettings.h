@@ -64,8 +64,14 @@ struct IntegratorSettings {
     int getActingForceGroups() const;
     /** Give the default monitor the kind that the System can have, unless the user has chosen monitors. */
     void fitDefaultMonitor(bool hasConstraints);
-    /** Throw an OpenMMException if a step cannot be taken with these settings, whatever the System. */
+    /** Whether the bounds lie on either side of the nominal step, where there is one and they have an effect. */
+    bool isConsistent() const;
+    /** Throw an OpenMMException unless isConsistent(). */
     void requireConsistent() const;
+    /** Whether both have the same constraints by expressions, but for the values of their parameters. */
+    bool hasSameConstraints(const IntegratorSettings& other) const;
+    /** Whether the values of their parameters are the same too. */
+    bool hasSameParameters(const IntegratorSettings& other) const;
 };
 
 } // namespace OpenMMVRattle

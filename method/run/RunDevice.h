@@ -37,9 +37,10 @@ public:
     // ------------------------------------------------------------------------------------------------- the settings
 
     /**
-     * Take over settings, which are valid and consistent (IntegratorSettings::requireConsistent()). Called before everything
-     * else, and again between steps when they have changed. In the course of a run the density goes on where the new settings allow
-     * it: it is scaled with u = U/U_ref. Values of parameters of expressions are compared with those in force.
+     * Take over settings, which are consistent (IntegratorSettings::isConsistent()) and have the constraints that the device was
+     * made with. Called before anything is asked that depends on them, and again between steps when they have changed. In the
+     * course of a run the density goes on where the new settings allow it: it is scaled with u = U/U_ref. The values of the
+     * parameters of expressions are compared with those in force.
      *
      * @throws StepFailure    if the System cannot have one of the monitors
      */
@@ -124,7 +125,7 @@ public:
 
     /**
      * Begin to take steps of a fixed size from the method's state, which have no density and are put back by endTrial(). What is
-     * asked of the device in between concerns the trial, but for time and step count, which stay as they are.
+     * asked of the device in between concerns the trial. Forces see the time of the trial, and the step count that there is.
      *
      * @param stepSize       the size of all steps (ps)
      * @param isBackwards    whether they go back in time (from the same positions with velocities of the other sign)
@@ -141,6 +142,8 @@ public:
     virtual std::vector<double> getMonitorValues() = 0;
     /** Lambda(q[n],p[n]), for the System's constraints and behind them for the expressions, in the users' units. */
     virtual std::vector<double> getMultipliers() = 0;
+    /** The kinetic energy of the Context's velocities (kJ/mol). */
+    virtual double computeKineticEnergy() = 0;
     /** How often forces have been computed, iterations of the solver taken, and steps rescued, since the device exists. */
     virtual long long getNumForceEvaluations() = 0;
     virtual long long getNumSolverIterations() = 0;
@@ -168,14 +171,20 @@ public:
      */
     virtual void save(RunState& run) = 0;
     /**
-     * Go on from a saved run, whose settings and references are in force and whose fingerprint is the Context's. Where the forces
-     * are computed for it they are compared with the saved ones, for a Force may have been changed since.
+     * Whether this device can go on from a saved run; not if it was saved by one that keeps other numbers.
      *
-     * @return whether it goes on; if not, because the forces are others or the run was saved by a device that keeps other numbers,
-     *         nothing has been taken over
+     * @param saved    the settings that were saved with it
      * @throws OpenMMException    if the parts of the saved run do not fit together
      */
-    virtual bool resume(const RunState& run) = 0;
+    virtual bool canResume(const RunState& run, const IntegratorSettings& saved) = 0;
+    /**
+     * Go on from a saved run, whose settings and references are in force and whose fingerprint is the Context's. The forces are
+     * computed, to compare them with the saved ones, for a Force may have been changed since; if they are the same but for
+     * rounding they take their place.
+     *
+     * @return whether it goes on; if not, nothing has been taken over
+     */
+    virtual bool resume(const RunState& run, const IntegratorSettings& saved) = 0;
 };
 
 } // namespace OpenMMVRattle

@@ -667,6 +667,7 @@ double VRattleDynamics::solveRegular() {
         if (!solveWith(density.boundedUpdate(u, rho)))
             throwNotConverged();
         numRescues++;
+        isRescued = true;
     }
     return h / rhoNext;
 }

@@ -52,22 +52,21 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 } // namespace
 
 StepMonitor::StepMonitor(const ConstraintSystem& system) :
-        system(system), normOrder(8), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0),
-        maxForce(0), forcePNorm(0), constraintForceSquared(0), blockSums(system.getBlocks().size() - 1),
-        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()),
-        velocityJacobian(system.getNumEntries()) {
+        system(system), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0), maxForce(0),
+        constraintForceSquared(0), blockSums(system.getBlocks().size() - 1), toSolve(system.getNumConstraints()),
+        solved(system.getNumConstraints()), velocityJacobian(system.getNumEntries()) {
 }
 
-void StepMonitor::setTerms(const vector<Term>& newTerms, double order) {
+void StepMonitor::setTerms(const vector<Term>& newTerms) {
     terms = newTerms;
-    normOrder = order;
+    forcePNorms.assign(terms.size(), 0.0);
 }
 
 bool StepMonitor::needsMultipliers() const {
     return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesMultipliers(term.kind); });
 }
 
-bool StepMonitor::needsConstraints() const {
+bool StepMonitor::needConstraints(const vector<Term>& terms) {
     return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesConstraintsOnly(term.kind); });
 }
 
@@ -108,7 +107,7 @@ void StepMonitor::sumForces(const vector<Vec3>& newForces, int block) {
 void StepMonitor::finishForces(const vector<Vec3>& newForces, double energy) {
     forces = &newForces;
     groupEnergy = energy;
-    appliedForceSquared = forceSquared = maxForce = forcePNorm = 0;
+    appliedForceSquared = forceSquared = maxForce = 0;
     const vector<double>& inverseMasses = system.getInverseMasses();
     const int numParticles = system.getNumParticles();
     auto squareOf = [&](int i) { return this->squareOf(newForces[i], i); };
@@ -124,8 +123,9 @@ void StepMonitor::finishForces(const vector<Vec3>& newForces, double energy) {
         for (int i = 0; i < numParticles; i++)
             maxForce = std::max(maxForce, squareOf(i));
     maxForce = std::sqrt(maxForce);
-    if (isWanted({ForcePNorm}))
-        forcePNorm = pNorm(numParticles, normOrder, [&](int i) { return std::sqrt(squareOf(i)); });
+    for (size_t k = 0; k < terms.size(); k++)
+        if (terms[k].kind == ForcePNorm)
+            forcePNorms[k] = pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(squareOf(i)); });
 }
 
 void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const vector<double>& rightSide,
@@ -135,7 +135,7 @@ void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipli
     constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
     values.resize(terms.size());
     for (size_t i = 0; i < terms.size(); i++)
-        values[i] = evaluateTerm(terms[i], v, multipliers);
+        values[i] = evaluateTerm(i, v, multipliers);
 }
 
 // du/dU_k
@@ -186,8 +186,8 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
         case MultiplierPNorm:
             for (int k = 0; k < numConstraints; k++) {
                 double x = system.toGivenMultiplier(k) * multipliers[k];
-                sum += std::copysign(std::pow(std::fabs(x) / value, normOrder - 1), x) * system.toGivenMultiplier(k) *
-                       multiplierRate[k];
+                sum += std::copysign(std::pow(std::fabs(x) / value, terms[i].order - 1), x) *
+                       system.toGivenMultiplier(k) * multiplierRate[k];
             }
             rate += factor * sum;
             break;
@@ -223,7 +223,8 @@ double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& mu
     return rate;
 }
 
-double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const vector<double>& multipliers) const {
+double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vector<double>& multipliers) const {
+    const Term& term = terms[index];
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     auto givenMultiplier = [&](int k) { return multipliers[k] * system.toGivenMultiplier(k); };
@@ -237,9 +238,9 @@ double StepMonitor::evaluateTerm(const Term& term, const vector<Vec3>& v, const 
     case ConstraintAndAppliedForce:
         return std::sqrt(constraintForceSquared + appliedForceSquared);
     case MultiplierPNorm:
-        return pNorm(numConstraints, normOrder, [&](int k) { return std::fabs(givenMultiplier(k)); });
+        return pNorm(numConstraints, term.order, [&](int k) { return std::fabs(givenMultiplier(k)); });
     case ForcePNorm:
-        return forcePNorm;
+        return forcePNorms[index];
     case VectorField: // (4.1)
         return std::sqrt(forceSquared +
                          sumOf(numParticles, [&](int i) { return masses[i] > 0 ? masses[i] * v[i].dot(v[i]) : 0.0; }));
@@ -336,7 +337,7 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& q, const vector<Vec3>& v,
             mustSolve = true;
             for (int k = 0; k < numConstraints; k++) {
                 double d = system.toGivenMultiplier(k), size = std::fabs(d * multipliers[k]);
-                double derivative = d * std::pow(size / value, normOrder - 1);
+                double derivative = d * std::pow(size / value, term.order - 1);
                 toSolve[k] += factor * (multipliers[k] < 0 ? -derivative : derivative);
             }
             break;

@@ -39,10 +39,11 @@ public:
         Kind kind;
         double weight, power;
         double reference; // U_k,ref; 0 while it is not known
+        double order = 8; // p of the p-norms, of no meaning to others
     };
 
     explicit StepMonitor(const ConstraintSystem& system);
-    void setTerms(const std::vector<Term>& terms, double normOrder);
+    void setTerms(const std::vector<Term>& terms);
     const std::vector<Term>& getTerms() const {
         return terms;
     }
@@ -54,8 +55,8 @@ public:
     }
     /** Whether any term needs the multipliers. */
     bool needsMultipliers() const;
-    /** Whether any term is defined by the constraints alone, and so is zero without them. */
-    bool needsConstraints() const;
+    /** Whether any of some terms is defined by the constraints alone, and so is zero without them. */
+    static bool needConstraints(const std::vector<Term>& terms);
     /** Throws a StepFailure if a value is not a finite number, or negative. */
     void requireValid(const std::vector<double>& values) const;
     /** Whether any term changes with the velocities at fixed positions. */
@@ -132,16 +133,15 @@ public:
 
 private:
     double squareOf(const OpenMM::Vec3& force, int particle) const;
-    double evaluateTerm(const Term& term, const std::vector<OpenMM::Vec3>& v,
-                        const std::vector<double>& multipliers) const;
+    double evaluateTerm(size_t index, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
     int findFastest(const std::vector<OpenMM::Vec3>& v) const;
     const ConstraintSystem& system;
     std::vector<Term> terms;
-    double normOrder;
     const std::vector<OpenMM::Vec3>* forces;
-    double groupEnergy, appliedForceSquared, forceSquared, maxForce, forcePNorm, constraintForceSquared;
-    std::vector<double> blockSums; // of the squares of the forces
+    double groupEnergy, appliedForceSquared, forceSquared, maxForce, constraintForceSquared;
+    std::vector<double> forcePNorms; // of the terms of that kind
+    std::vector<double> blockSums;   // of the squares of the forces
     std::vector<double> toSolve, solved;
     ConstraintSystem::Jacobian velocityJacobian;
 };

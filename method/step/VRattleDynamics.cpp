@@ -25,8 +25,8 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
         system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
         automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
         hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor),
-        isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0), numIterations(0), numRescues(0),
-        lastError(0) {
+        isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0), isRescued(false),
+        numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -49,14 +49,16 @@ void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
+    requireConstraintsFor(newSettings.terms);
     const bool sameControl = takeAutomaticReferences(newSettings) && newSettings.isAutomatic == settings.isAutomatic;
-    bool sameTerms = newSettings.terms.size() == settings.terms.size() && newSettings.normOrder == settings.normOrder &&
-                     newSettings.isFixedStep == settings.isFixedStep;
+    bool sameTerms =
+        newSettings.terms.size() == settings.terms.size() && newSettings.isFixedStep == settings.isFixedStep;
     bool retakeReference = false;
     vector<StepMonitor::Term> terms = newSettings.terms;
     for (size_t i = 0; i < terms.size() && sameTerms; i++) {
         const StepMonitor::Term& old = settings.terms[i];
-        sameTerms = terms[i].kind == old.kind && terms[i].weight == old.weight && terms[i].power == old.power;
+        sameTerms = terms[i].kind == old.kind && terms[i].weight == old.weight && terms[i].power == old.power &&
+                    terms[i].order == old.order;
         if (terms[i].reference == 0 && old.reference == 0)
             terms[i].reference = monitor.getTerms()[i].reference; // taken at the first step, and still in force
         else if (terms[i].reference == 0)
@@ -70,8 +72,7 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     for (size_t i = 0; i < terms.size() && sameDensity; i++)
         sameDensity = terms[i].reference == monitor.getTerms()[i].reference;
     settings = newSettings;
-    monitor.setTerms(terms, settings.normOrder);
-    requireConstraintsForMonitors();
+    monitor.setTerms(terms);
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
     if (q.empty() || sameDensity)
         return;
@@ -136,8 +137,8 @@ double VRattleDynamics::combineAndLimit(const vector<double>& monitorValues) con
     return settings.isFixedStep ? 1.0 : density.limit(monitor.combine(monitorValues));
 }
 
-void VRattleDynamics::requireConstraintsForMonitors() const {
-    if (system.getNumConstraints() == 0 && monitor.needsConstraints())
+void VRattleDynamics::requireConstraintsFor(const vector<StepMonitor::Term>& terms) const {
+    if (system.getNumConstraints() == 0 && StepMonitor::needConstraints(terms))
         throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
                           "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
                           "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
@@ -147,6 +148,7 @@ void VRattleDynamics::requireConstraintsForMonitors() const {
 
 void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                             double energy) {
+    const Kept before = keep();
     q = positions;
     v = velocities;
     force = forces;
@@ -157,7 +159,13 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     forgetDensity();
     densityOffset = 0;
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
-    evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+    try {
+        evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+    }
+    catch (...) {
+        putBack(before);
+        throw;
+    }
     isMonitorCurrent = true;
     if (settings.isAutomatic)
         automatic.begin(v, force, lambda, rightSide);
@@ -185,16 +193,40 @@ VRattleDynamics::Memory VRattleDynamics::getMemory() const {
                      rate,
                      densityOffset,
                      automatic.getMemory()};
-    const size_t numReferences = settings.isAutomatic ? AutomaticControl::NUM_MONITORS : monitor.getTerms().size();
-    for (size_t k = 0; k < numReferences; k++)
-        memory.references.push_back(getReference((int) k));
+    memory.references = getReferences();
     return memory;
 }
 
-void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
-                             double energy, const Memory& memory) {
-    begin(positions, velocities, forces, energy);
-    v = velocities; // begin() has projected them, which changes the last bits
+vector<double> VRattleDynamics::getReferences() const {
+    vector<double> references;
+    if (settings.isAutomatic)
+        for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
+            references.push_back(automatic.getReference(k));
+    else
+        for (const StepMonitor::Term& term : monitor.getTerms())
+            references.push_back(term.reference);
+    return references;
+}
+
+VRattleDynamics::Kept VRattleDynamics::keep() const {
+    return {settings, q, v, force, groupEnergy, getMemory(), rightSide};
+}
+
+void VRattleDynamics::putBack(const Kept& kept) {
+    settings = kept.settings;
+    monitor.setTerms(settings.terms);
+    density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
+    q = kept.positions;
+    v = kept.velocities;
+    force = kept.forces;
+    groupEnergy = kept.groupEnergy;
+    rightSide = kept.rightSide;
+    setMemory(kept.memory);
+    factorScope = NoFactor;
+    isMonitorCurrent = false;
+}
+
+void VRattleDynamics::setMemory(const Memory& memory) {
     lambda = memory.multipliers;
     values = memory.monitorValues;
     setReferences(memory.references);
@@ -209,6 +241,14 @@ void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& 
     halfStepValue = memory.halfStepValue;
     rate = memory.rate;
     densityOffset = memory.densityOffset;
+    firstDensity = 0;
+}
+
+void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                             double energy, const Memory& memory) {
+    begin(positions, velocities, forces, energy);
+    v = velocities; // begin() has projected them, which changes the last bits
+    setMemory(memory);
 }
 
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
@@ -232,6 +272,7 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
 }
 
 bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
+    ensureFactor(NoFactor);
     if (!system.isTranslationInvariant() || movingParticles.empty())
         return false;
     const Vec3 shift = velocities[movingParticles[0]] - v[movingParticles[0]];
@@ -292,12 +333,16 @@ void VRattleDynamics::formHalfStepVelocities() {
 
 double VRattleDynamics::step(double maxStep) {
     work.beginStep();
+    isRescued = false;
+    ensureFactor(NoFactor); // of a step before that has failed, the monitor may have the forces still
     double full;
     if (hasDensity) {
         stepKind = Regular;
         full = solveRegular();
     }
     else {
+        if (firstDensity == 0)
+            referencesBefore = getReferences();
         if (settings.isAutomatic && !settings.isFixedStep)
             throw StepFailure("the automatic step control has not been started");
         stepKind = First;
@@ -379,6 +424,14 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     if (hasDensity && stepKind == Shortened)
         formHalfStepVelocities();
     return true;
+}
+
+void VRattleDynamics::abandonStep() {
+    numRescues -= isRescued;
+    isRescued = false;
+    if (!hasDensity)
+        setReferences(referencesBefore);
+    firstDensity = 0;
 }
 
 void VRattleDynamics::acceptAutomatic() {

@@ -42,7 +42,6 @@ public:
         double tolerance;                     // of the constraints, relative
         StepDensity::Update update;
         std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
-        double normOrder;
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
         // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
         bool isAutomatic = false;
@@ -92,9 +91,24 @@ public:
      * @throws StepFailure    if there is no such configuration nearby
      */
     bool projectPositions(std::vector<OpenMM::Vec3>& positions);
-    /** Start afresh at a state. The velocities are projected onto the constraints. */
+    /**
+     * Start afresh at a state. The velocities are projected onto the constraints.
+     *
+     * @throws StepFailure    if the multipliers or monitors are not defined there; then everything is as it was
+     */
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** All that a trial run or a start changes, to be put back. */
+    struct Kept {
+        Settings settings;
+        std::vector<OpenMM::Vec3> positions, velocities, forces;
+        double groupEnergy;
+        Memory memory;
+        std::vector<double> rightSide;
+    };
+    Kept keep() const;
+    /** Put back what was kept, to the last bit. */
+    void putBack(const Kept& kept);
     Memory getMemory() const;
     /** Change the parameters of an expression, before the next begin(). */
     void setParameters(int expression, const std::map<std::string, double>& parameters) {
@@ -141,6 +155,11 @@ public:
      * @throws StepFailure    if the forces are not finite or the constraints have become dependent
      */
     bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * The step in progress has failed, in either half or in between: nothing that was computed for it, as the density and the
+     * reference values of a first step, is of any use to the next.
+     */
+    void abandonStep();
     /** Whether the next step continues a sequence of densities; if not, it is the first one. */
     bool hasStarted() const {
         return hasDensity;
@@ -187,9 +206,7 @@ public:
         return values;
     }
     /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
-    double getReference(int index) const {
-        return settings.isAutomatic ? automatic.getReference(index) : monitor.getTerms()[index].reference;
-    }
+    std::vector<double> getReferences() const;
     /** Lambda(q[n],p[n]) for the constraints as ConstraintSystem writes them, in internal order. */
     const std::vector<double>& getMultipliers() const {
         return lambda;
@@ -205,9 +222,10 @@ private:
     enum StepKind { Regular, First, Shortened };
     enum SolveResult { Converged, TooSlow, NotConverged, NotPositive };
     enum FactorScope { NoFactor, GeneralFactor, FullFactor };
-    void requireConstraintsForMonitors() const;
+    void requireConstraintsFor(const std::vector<StepMonitor::Term>& terms) const;
     bool takeAutomaticReferences(const Settings& newSettings);
     void acceptAutomatic();
+    void setMemory(const Memory& memory);
     void forgetDensity();
     void rescaleDensity(double oldU);
     double combineAndLimit(const std::vector<double>& monitorValues) const;
@@ -294,6 +312,7 @@ private:
     double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
     double densityOffset; // what (3.14) and (3.15) differed by in the last step
     double firstDensity; // of the first step, once it is known; else 0
+    std::vector<double> referencesBefore; // the first step, as long as firstDensity is known
 
     // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
     FactorScope factorScope;
@@ -315,6 +334,7 @@ private:
     std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
     std::vector<double> lambdaBack, rightSideBack;
 
+    bool isRescued; // by the step in progress
     long long numIterations, numRescues;
     double lastError; // the largest relative error of a constraint that the last iteration left
 };

@@ -84,10 +84,10 @@ int main() {
     const Example e = makeExample();
     auto make = [](StepDensity::Update update) {
         return VRattleDynamics::Settings{
-            0.001, 0.001 / 50, 0.002, 1e-8, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
+            0.001, 0.001 / 50, 0.002, 1e-8, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false};
     };
-    const VRattleDynamics::Settings automatic = {0.001, 0,    0,          1e-8, StepDensity::SemiExplicit, {}, 8,
-                                                 false, true, {1e4, 1e4}, 0};
+    const VRattleDynamics::Settings automatic = {0.001, 0,     0,    1e-8,       StepDensity::SemiExplicit,
+                                                 {},    false, true, {1e4, 1e4}, 0};
     TestList tests;
     for (int numThreads : {1, 2}) {
         const std::string threads = std::to_string(numThreads) + (numThreads == 1 ? " thread" : " threads");

@@ -175,7 +175,7 @@ void testNewtonMatrix(const Example& e) {
 }
 
 static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
-    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false};
+    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false};
 }
 
 void testSteps(const Example& e, StepDensity::Update update) {
@@ -186,7 +186,7 @@ void testSteps(const Example& e, StepDensity::Update update) {
     takeSteps(dynamics, 1);
     const vector<Vec3> after = dynamics.getPositions();
     const ConstraintSystem& system = dynamics.getConstraintSystem();
-    const double reference = dynamics.getReference(0);
+    const double reference = dynamics.getReferences()[0];
     vector<double> g(system.getNumConstraints()), curvature(system.getNumConstraints());
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
     for (int i = 0; i < 6; i++) {
@@ -235,8 +235,8 @@ void testProjection(const Example& e) {
 }
 
 void testThreads(const Example& e) {
-    const VRattleDynamics::Settings automatic = {
-        0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {3000, 3000}, 0};
+    const VRattleDynamics::Settings automatic = {0.002, 0,     0,    1e-10,        StepDensity::SemiExplicit,
+                                                 {},    false, true, {3000, 3000}, 0};
     for (const VRattleDynamics::Settings& settings :
          {makeSettings(StepDensity::SemiExplicit), makeSettings(StepDensity::Explicit), automatic}) {
         vector<Vec3> positions;

@@ -66,7 +66,7 @@ static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
 }
 
 static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
-    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, 8, false};
+    return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, false};
 }
 
 // Both halves of a step; returns whether it is complete.
@@ -78,7 +78,7 @@ static bool takeStep(VRattleDynamics& dynamics) {
 
 static VRattleDynamics::Settings makeAutomaticSettings() {
     // References far below the monitors' values, so that the density is not 1.
-    return {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, 8, false, true, {30, 20}, 0};
+    return {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, false, true, {30, 20}, 0};
 }
 
 static void run(VRattleDynamics& dynamics, const Example& e, int steps, bool isAutomatic = false) {
@@ -125,7 +125,7 @@ void testShapes(StepDensity::Update update) {
         ASSERT_EQUAL((int) e.constraints.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
         dynamics.setSettings(makeSettings(update));
         run(dynamics, e, 1);
-        const double reference = dynamics.getReference(0);
+        const double reference = dynamics.getReferences()[0];
         for (int i = 0; i < 50; i++) {
             const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
             ASSERT(takeStep(dynamics));

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
-#include "CheckpointBlock.h"
 #include "ExpressionCheck.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
@@ -12,9 +11,10 @@
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/XmlSerializer.h"
 #include "openmmvrattle/VRattleKernels.h"
+#include "run/CheckpointBlock.h"
+#include "run/IntegratorRun.h"
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <memory>
 #include <sstream>
 
@@ -30,20 +30,9 @@ using std::vector;
 
 namespace {
 
-// The bounds' defaults as fractions of the nominal step size (API: nominal/50 and 2 nominal).
-const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
-const double DEFAULT_MAXIMUM_FACTOR = 2.0;
-const double USE_DEFAULT = -1.0;
-const int DEFAULT_CALIBRATION_STEPS = 300;
-const int NUM_AUTOMATIC_MONITORS = 2;
-
 // Of the parameters that States hold; the settings among them have a version of their own.
 const int PARAMETERS_VERSION = 1;
 const char TYPE_NAME[] = "VariableStepRattleIntegrator";
-
-// The changes that Context::loadCheckpoint() announces after our loadCheckpoint(), in this order.
-const State::DataType CHANGES_AFTER_LOADING[] = {State::Positions, State::Velocities, State::Parameters, State::Energy};
-const int NUM_CHANGES_AFTER_LOADING = 4;
 
 void requirePositive(double value, const string& name) {
     if (!(value > 0) || !std::isfinite(value)) {
@@ -53,13 +42,19 @@ void requirePositive(double value, const string& name) {
     }
 }
 
-void requireBound(double value, const string& name) {
+// What 0 stands for belongs to the message.
+void requirePositiveOrZero(double value, const string& name, const string& zero) {
     if (!(value >= 0) || !std::isfinite(value)) {
         std::stringstream message;
-        message << "VariableStepRattleIntegrator: the " << name
-                << " must be a positive finite number, or 0 for no bound, not " << value;
+        message << "VariableStepRattleIntegrator: the " << name << " must be a positive finite number, or 0 " << zero
+                << ", not " << value;
         throw OpenMMException(message.str());
     }
+}
+
+void requireOrder(double order) {
+    if (!(order >= 1) || !std::isfinite(order))
+        throw OpenMMException("VariableStepRattleIntegrator: the order of a norm must be a finite number, at least 1");
 }
 
 string majorMinor(const string& version) {
@@ -92,99 +87,120 @@ void refuseDrudeParticles(ContextImpl& context) {
     }
 }
 
-bool haveSameNames(const std::map<string, double>& a, const std::map<string, double>& b) {
-    return a.size() == b.size() &&
-           std::equal(a.begin(), a.end(), b.begin(), [](const auto& x, const auto& y) { return x.first == y.first; });
+// Whether a System has a constraint that could move anything, of its own or by expression.
+bool hasConstraints(const OpenMM::System& system, const IntegratorSettings& settings) {
+    for (int i = 0; i < system.getNumConstraints(); i++) {
+        int particle1, particle2;
+        double distance;
+        system.getConstraintParameters(i, particle1, particle2, distance);
+        if (system.getParticleMass(particle1) > 0 || system.getParticleMass(particle2) > 0)
+            return true;
+    }
+    return !settings.expressions.empty();
 }
 
 } // namespace
 
 VariableStepRattleIntegrator::VariableStepRattleIntegrator(double stepSize) :
-        nominalStepSize(0), lastStepSize(0), minimumStepSize(USE_DEFAULT), maximumStepSize(USE_DEFAULT),
-        updateMethod(SemiExplicit), monitorForceGroup(31), normOrder(8), automatic(false),
-        calibrationSteps(DEFAULT_CALIBRATION_STEPS), numAutomaticRequests(0), automaticReferences(),
-        reinitializationPhase(None), numChangesAfterLoading(NUM_CHANGES_AFTER_LOADING) {
-    monitors.push_back({ConstraintMultipliers, 1.0, 1.0, 0.0});
+        settings(std::make_unique<IntegratorSettings>(stepSize)), lastSaved(0) {
     setNominalStepSize(stepSize);
-    setConstraintTolerance(1e-8);
+    Integrator::setConstraintTolerance(settings->constraintTolerance);
+    Integrator::setIntegrationForceGroups(settings->forceGroups);
 }
 
-double VariableStepRattleIntegrator::getNominalStepSize() const {
-    return nominalStepSize;
+VariableStepRattleIntegrator::VariableStepRattleIntegrator(const VariableStepRattleIntegrator& other) :
+        Integrator(), settings(std::make_unique<IntegratorSettings>(*other.settings)), lastSaved(0),
+        checkedExpressions(other.checkedExpressions) {
+    takeOver(*other.settings);
 }
 
-void VariableStepRattleIntegrator::setNominalStepSize(double size) {
-    requirePositive(size, "step size");
-    checkBounds(size, minimumStepSize, maximumStepSize);
-    nominalStepSize = size;
-    Integrator::setStepSize(size);
+VariableStepRattleIntegrator::~VariableStepRattleIntegrator() = default;
+
+// -------------------------------------------------------------------------------------------------------- the settings
+
+void VariableStepRattleIntegrator::settingsChanged() {
+    if (run != nullptr)
+        run->settingsChanged();
+}
+
+// Replace all settings, those that the base class keeps as well.
+void VariableStepRattleIntegrator::takeOver(const IntegratorSettings& newSettings) {
+    *settings = newSettings;
+    Integrator::setStepSize(settings->stepSize);
+    Integrator::setConstraintTolerance(settings->constraintTolerance);
+    Integrator::setIntegrationForceGroups(settings->forceGroups);
     settingsChanged();
 }
 
+double VariableStepRattleIntegrator::getNominalStepSize() const {
+    return settings->stepSize;
+}
+
+void VariableStepRattleIntegrator::setNominalStepSize(double size) {
+    requirePositiveOrZero(size, "step size", "where no step is to be taken");
+    settings->stepSize = size;
+    Integrator::setStepSize(size);
+    if (run != nullptr)
+        run->nominalStepChanged();
+}
+
 double VariableStepRattleIntegrator::getStepSize() const {
-    return lastStepSize > 0 ? lastStepSize : nominalStepSize;
+    return run == nullptr ? settings->stepSize : run->getStepSize();
 }
 
 void VariableStepRattleIntegrator::setStepSize(double size) {
     setNominalStepSize(size);
 }
 
-bool VariableStepRattleIntegrator::hasMinimumStepSize() const {
-    return minimumStepSize >= 0;
-}
-
-bool VariableStepRattleIntegrator::hasMaximumStepSize() const {
-    return maximumStepSize >= 0;
-}
-
 double VariableStepRattleIntegrator::getMinimumStepSize() const {
-    return minimumStepSize < 0 ? DEFAULT_MINIMUM_FACTOR * nominalStepSize : minimumStepSize;
+    return settings->getMinimumStep();
 }
 
 void VariableStepRattleIntegrator::setMinimumStepSize(double size) {
-    requireBound(size, "minimum step size");
-    checkBounds(nominalStepSize, size, maximumStepSize);
-    minimumStepSize = size;
+    requirePositiveOrZero(size, "minimum step size", "for no bound");
+    settings->minimumStep = size;
     settingsChanged();
 }
 
 double VariableStepRattleIntegrator::getMaximumStepSize() const {
-    return maximumStepSize < 0 ? DEFAULT_MAXIMUM_FACTOR * nominalStepSize : maximumStepSize;
+    return settings->getMaximumStep();
 }
 
 void VariableStepRattleIntegrator::setMaximumStepSize(double size) {
-    requireBound(size, "maximum step size");
-    checkBounds(nominalStepSize, minimumStepSize, size);
-    maximumStepSize = size;
+    requirePositiveOrZero(size, "maximum step size", "for no bound");
+    settings->maximumStep = size;
     settingsChanged();
 }
 
 VariableStepRattleIntegrator::UpdateMethod VariableStepRattleIntegrator::getUpdateMethod() const {
-    return updateMethod;
+    return (UpdateMethod) settings->update;
 }
 
 void VariableStepRattleIntegrator::setUpdateMethod(UpdateMethod method) {
     if (method < SemiExplicit || method > Bounded)
         throw OpenMMException(
             "VariableStepRattleIntegrator: the update method must be SemiExplicit, Explicit or Bounded");
-    updateMethod = method;
+    settings->update = (StepDensity::Update) method;
     settingsChanged();
 }
 
-int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, double power) {
+int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, double power, double order) {
     if (kind < ConstraintMultipliers || kind > ForceGroupEnergy)
         throw OpenMMException("VariableStepRattleIntegrator: there is no monitor of kind " + std::to_string(kind));
     requirePositive(weight, "weight of a monitor");
     requirePositive(power, "power of a monitor");
-    automatic = false;
-    monitors.push_back({kind, weight, power, 0.0});
+    if (order != 0)
+        requireOrder(order);
+    settings->isAutomatic = settings->isDefaultMonitor = false;
+    settings->monitors.push_back(
+        {(StepMonitor::Kind) kind, weight, power, 0.0, order == 0 ? settings->normOrder : order});
     settingsChanged();
-    return (int) monitors.size() - 1;
+    return (int) settings->monitors.size() - 1;
 }
 
 void VariableStepRattleIntegrator::clearMonitors() {
-    automatic = false;
-    monitors.clear();
+    settings->isAutomatic = settings->isDefaultMonitor = false;
+    settings->monitors.clear();
     settingsChanged();
 }
 
@@ -193,40 +209,40 @@ void VariableStepRattleIntegrator::useAutomaticStepControl(int steps) {
         throw OpenMMException("VariableStepRattleIntegrator: automatic step control needs at least one calibration "
                               "step, not " +
                               std::to_string(steps));
-    automatic = true;
-    calibrationSteps = steps;
-    numAutomaticRequests++;
-    for (double& reference : automaticReferences)
+    clearMonitors();
+    settings->isAutomatic = true;
+    settings->calibrationSteps = steps;
+    settings->automaticRequest++;
+    for (double& reference : settings->automaticReferences)
         reference = 0;
-    monitors.clear();
-    settingsChanged();
 }
 
 bool VariableStepRattleIntegrator::isAutomatic() const {
-    return automatic;
+    return settings->isAutomatic;
 }
 
 int VariableStepRattleIntegrator::getCalibrationSteps() const {
-    return calibrationSteps;
-}
-
-int VariableStepRattleIntegrator::getNumAutomaticRequests() const {
-    return numAutomaticRequests;
+    return settings->calibrationSteps;
 }
 
 int VariableStepRattleIntegrator::getNumMonitors() const {
-    return (int) monitors.size();
+    return (int) settings->monitors.size();
 }
 
 void VariableStepRattleIntegrator::getMonitor(int index, MonitorKind& kind, double& weight, double& power) const {
     checkMonitorIndex(index);
-    kind = monitors[index].kind;
-    weight = monitors[index].weight;
-    power = monitors[index].power;
+    kind = (MonitorKind) settings->monitors[index].kind;
+    weight = settings->monitors[index].weight;
+    power = settings->monitors[index].power;
+}
+
+double VariableStepRattleIntegrator::getMonitorNormOrder(int index) const {
+    checkMonitorIndex(index);
+    return settings->monitors[index].order;
 }
 
 int VariableStepRattleIntegrator::getMonitorForceGroup() const {
-    return monitorForceGroup;
+    return settings->monitorForceGroup;
 }
 
 void VariableStepRattleIntegrator::setMonitorForceGroup(int group) {
@@ -234,27 +250,26 @@ void VariableStepRattleIntegrator::setMonitorForceGroup(int group) {
         throw OpenMMException("VariableStepRattleIntegrator: the force group of the monitor must lie between 0 and 31, "
                               "not " +
                               std::to_string(group));
-    monitorForceGroup = group;
+    settings->monitorForceGroup = group;
     settingsChanged();
 }
 
 double VariableStepRattleIntegrator::getNormOrder() const {
-    return normOrder;
+    return settings->normOrder;
 }
 
 void VariableStepRattleIntegrator::setNormOrder(double order) {
-    if (!(order >= 1) || !std::isfinite(order))
-        throw OpenMMException("VariableStepRattleIntegrator: the order of a norm must be a finite number, at least 1");
-    normOrder = order;
+    requireOrder(order);
+    settings->normOrder = order;
+    for (StepMonitor::Term& monitor : settings->monitors)
+        monitor.order = order;
     settingsChanged();
 }
 
 double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
-    const double given = getSetReferenceMonitorValue(index);
-    if (context == NULL || given > 0)
-        return given;
-    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
-    return stateful.getAs<IntegrateVRattleStepKernel>().getReferenceMonitorValue(*context, *this, index);
+    checkReferenceIndex(index);
+    const double given = settings->getReference(index);
+    return run == nullptr || given > 0 ? given : run->getReference(index);
 }
 
 void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
@@ -263,67 +278,70 @@ void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int in
         throw OpenMMException(
             "VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
             "number, or 0 to take it at the first step");
-    (automatic ? automaticReferences[index] : monitors[index].reference) = value;
+    settings->reference(index) = value;
+    if (value > 0) // it is of this kind of monitor and no other
+        settings->isDefaultMonitor = false;
     settingsChanged();
-}
-
-double VariableStepRattleIntegrator::getSetReferenceMonitorValue(int index) const {
-    checkReferenceIndex(index);
-    return automatic ? automaticReferences[index] : monitors[index].reference;
 }
 
 void VariableStepRattleIntegrator::calibrate(int steps) {
-    requireContext();
+    IntegratorRun& here = requireRun();
     if (steps < 1)
         throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs at least one trial step");
-    if (monitors.empty() && !automatic)
+    if (settings->getNumReferences() == 0)
         throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs a monitor; add one with addMonitor()");
-    vector<double> means = kernel.getAs<IntegrateVRattleStepKernel>().calibrate(*context, *this, steps);
+    const vector<double> means = here.calibrate(steps);
     for (size_t i = 0; i < means.size(); i++)
-        (automatic ? automaticReferences[i] : monitors[i].reference) = means[i];
-    settingsChanged();
+        setReferenceMonitorValue(means[i], (int) i);
 }
 
 double VariableStepRattleIntegrator::getStepDensity() const {
-    return context == NULL ? 1.0 : kernel.getAs<IntegrateVRattleStepKernel>().getStepDensity();
+    return run == nullptr ? 1.0 : run->getStepDensity();
 }
 
 double VariableStepRattleIntegrator::getMonitorValue(int index) const {
-    requireContext();
+    IntegratorRun& here = requireRun();
     checkReferenceIndex(index);
-    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
-    return stateful.getAs<IntegrateVRattleStepKernel>().getMonitorValue(*context, *this, index);
+    return here.getMonitorValue(index);
 }
 
 vector<double> VariableStepRattleIntegrator::getMultipliers() const {
-    requireContext();
-    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
-    return stateful.getAs<IntegrateVRattleStepKernel>().getMultipliers(*context, *this);
+    return requireRun().getMultipliers();
 }
 
 long long VariableStepRattleIntegrator::getNumForceEvaluations() const {
-    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumForceEvaluations();
+    return run == nullptr ? 0 : run->getDevice().getNumForceEvaluations();
 }
 
 long long VariableStepRattleIntegrator::getNumSolverIterations() const {
-    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumSolverIterations();
+    return run == nullptr ? 0 : run->getDevice().getNumSolverIterations();
 }
 
 long long VariableStepRattleIntegrator::getNumRescues() const {
-    return context == NULL ? 0 : kernel.getAs<IntegrateVRattleStepKernel>().getNumRescues();
+    return run == nullptr ? 0 : run->getDevice().getNumRescues();
 }
 
 void VariableStepRattleIntegrator::setConstraintTolerance(double tol) {
     requirePositive(tol, "constraint tolerance");
     Integrator::setConstraintTolerance(tol);
+    settings->constraintTolerance = tol;
+    settingsChanged();
+}
+
+int VariableStepRattleIntegrator::getIntegrationForceGroups() const {
+    return settings->getActingForceGroups();
+}
+
+void VariableStepRattleIntegrator::setIntegrationForceGroups(int groups) {
+    Integrator::setIntegrationForceGroups(groups);
+    settings->forceGroups = groups;
     settingsChanged();
 }
 
 // ------------------------------------------------------------------------------------------ constraints by expressions
 
-VariableStepRattleIntegrator::ExpressionConstraint
-VariableStepRattleIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
-                                              const std::map<string, double>& parameters) {
+void VariableStepRattleIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
+                                                   const std::map<string, double>& parameters) {
     const string constraint = "VariableStepRattleIntegrator: the constraint \"" + expression + "\" ";
     vector<string> names;
     for (const auto& parameter : parameters) {
@@ -346,18 +364,18 @@ VariableStepRattleIntegrator::checkConstraint(const string& expression, const ve
         requireValidExpression(expression, (int) particles.size(), parameters);
         checkedExpressions.insert(key);
     }
-    return {expression, particles, parameters};
 }
 
 int VariableStepRattleIntegrator::addConstraint(const string& expression, const vector<int>& particles,
                                                 const std::map<string, double>& parameters) {
-    expressionConstraints.push_back(checkConstraint(expression, particles, parameters));
+    checkConstraint(expression, particles, parameters);
+    settings->expressions.push_back({expression, particles, parameters});
     settingsChanged();
-    return (int) expressionConstraints.size() - 1;
+    return (int) settings->expressions.size() - 1;
 }
 
 int VariableStepRattleIntegrator::getNumExpressionConstraints() const {
-    return (int) expressionConstraints.size();
+    return (int) settings->expressions.size();
 }
 
 void VariableStepRattleIntegrator::checkExpressionConstraintIndex(int index) const {
@@ -371,22 +389,23 @@ void VariableStepRattleIntegrator::getExpressionConstraintParameters(int index, 
                                                                      vector<int>& particles,
                                                                      std::map<string, double>& parameters) const {
     checkExpressionConstraintIndex(index);
-    expression = expressionConstraints[index].expression;
-    particles = expressionConstraints[index].particles;
-    parameters = expressionConstraints[index].parameters;
+    expression = settings->expressions[index].expression;
+    particles = settings->expressions[index].particles;
+    parameters = settings->expressions[index].parameters;
 }
 
 void VariableStepRattleIntegrator::setExpressionConstraintParameters(int index, const string& expression,
                                                                      const vector<int>& particles,
                                                                      const std::map<string, double>& parameters) {
     checkExpressionConstraintIndex(index);
-    expressionConstraints[index] = checkConstraint(expression, particles, parameters);
+    checkConstraint(expression, particles, parameters);
+    settings->expressions[index] = {expression, particles, parameters};
     settingsChanged();
 }
 
-void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, const string& name, double value) {
+void VariableStepRattleIntegrator::setExpressionParameterValue(int index, const string& name, double value) {
     checkExpressionConstraintIndex(index);
-    ExpressionConstraint changed = expressionConstraints[index];
+    OpenMMVRattle::ExpressionConstraint changed = settings->expressions[index];
     if (changed.parameters.count(name) == 0)
         throw OpenMMException("VariableStepRattleIntegrator: the constraint \"" + changed.expression +
                               "\" has no parameter " + name);
@@ -394,8 +413,12 @@ void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, c
     setExpressionConstraintParameters(index, changed.expression, changed.particles, changed.parameters);
 }
 
+void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, const string& name, double value) {
+    setExpressionParameterValue(index, name, value);
+}
+
 double VariableStepRattleIntegrator::getExpressionConstraintMultiplier(int index) const {
-    requireContext();
+    requireRun();
     checkExpressionConstraintIndex(index);
     const int numDistances = context->getSystem().getNumConstraints();
     return getMultipliers().at(numDistances + index);
@@ -403,7 +426,7 @@ double VariableStepRattleIntegrator::getExpressionConstraintMultiplier(int index
 
 // What can be known of the constraints without positions.
 void VariableStepRattleIntegrator::checkExpressionConstraints(const ContextImpl& contextRef) const {
-    if (expressionConstraints.empty())
+    if (settings->expressions.empty())
         return;
     const Platform& platform = const_cast<ContextImpl&>(contextRef).getPlatform();
     if (dynamic_cast<const OpenMM::ReferencePlatform*>(&platform) == NULL)
@@ -413,9 +436,9 @@ void VariableStepRattleIntegrator::checkExpressionConstraints(const ContextImpl&
     const OpenMM::System& system = contextRef.getSystem();
     for (int i = 0; i < getNumExpressionConstraints(); i++) {
         const string constraint = "VariableStepRattleIntegrator: expression constraint " + std::to_string(i) + " (" +
-                                  expressionConstraints[i].expression + ") ";
+                                  settings->expressions[i].expression + ") ";
         bool canMove = false;
-        for (int particle : expressionConstraints[i].particles) {
+        for (int particle : settings->expressions[i].particles) {
             if (particle >= system.getNumParticles())
                 throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
                                       ", and the System has " + std::to_string(system.getNumParticles()));
@@ -429,41 +452,27 @@ void VariableStepRattleIntegrator::checkExpressionConstraints(const ContextImpl&
     }
 }
 
-// The values of the parameters of another integrator's constraints, where these are the same constraints.
-void VariableStepRattleIntegrator::copyExpressionParameters(const VariableStepRattleIntegrator& other) {
-    const auto areAlike = [](const ExpressionConstraint& a, const ExpressionConstraint& b) {
-        return a.expression == b.expression && a.particles == b.particles && haveSameNames(a.parameters, b.parameters);
-    };
-    if (std::equal(expressionConstraints.begin(), expressionConstraints.end(), other.expressionConstraints.begin(),
-                   other.expressionConstraints.end(), areAlike))
-        expressionConstraints = other.expressionConstraints;
-}
-
 // ----------------------------------------------------------------------------------------------------------- the run
 
+IntegratorRun& VariableStepRattleIntegrator::requireRun() const {
+    if (run == nullptr)
+        throw OpenMMException("This Integrator is not bound to a context!");
+    return *run;
+}
+
 void VariableStepRattleIntegrator::step(int steps) {
-    requireContext();
-    for (int i = 0; i < steps; i++)
-        lastStepSize = advance(std::numeric_limits<double>::infinity());
+    requireRun().step(steps);
 }
 
 void VariableStepRattleIntegrator::stepTo(double time) {
-    requireContext();
+    IntegratorRun& here = requireRun();
     if (!std::isfinite(time))
         throw OpenMMException("VariableStepRattleIntegrator: stepTo() needs a finite time");
-    while (time > context->getTime())
-        lastStepSize = advance(time);
-}
-
-double VariableStepRattleIntegrator::advance(double maxTime) {
-    reinitializationPhase = None;
-    bool forcesInvalid = context->updateContextState();
-    return kernel.getAs<IntegrateVRattleStepKernel>().execute(*context, *this, forcesInvalid, maxTime);
+    here.stepTo(time);
 }
 
 void VariableStepRattleIntegrator::reverse() {
-    requireContext();
-    kernel.getAs<IntegrateVRattleStepKernel>().reverse(*context, *this);
+    requireRun().reverse();
 }
 
 void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
@@ -472,38 +481,32 @@ void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
         throw OpenMMException("This Integrator is already bound to a context");
     refuseDrudeParticles(contextRef);
     checkExpressionConstraints(contextRef);
+    const OpenMM::System& system = contextRef.getSystem();
+    settings->fitDefaultMonitor(hasConstraints(system, *settings));
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
-    created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef.getSystem(), *this);
+    RunDevice& device = created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef, *this, *settings);
+    run = std::make_unique<IntegratorRun>(device, *settings, system.getNumParticles(),
+                                          RunState::fingerprintOf(system, *settings));
+    kernel = created;
     context = &contextRef;
     owner = &contextRef.getOwner();
-    kernel = created;
-    lastStepSize = 0;
 }
 
 void VariableStepRattleIntegrator::cleanup() {
+    run.reset();
     kernel = OpenMM::Kernel();
-    if (reinitializationPhase == CheckpointWritten)
-        reinitializationPhase = CleanedUp;
 }
 
 vector<string> VariableStepRattleIntegrator::getKernelNames() {
     return {IntegrateVRattleStepKernel::Name()};
 }
 
-void VariableStepRattleIntegrator::stateChanged(State::DataType changed) {
-    reinitializationPhase = None;
-    // What is announced after loading a checkpoint has been read from it and is no change.
-    if (numChangesAfterLoading < NUM_CHANGES_AFTER_LOADING &&
-        changed == CHANGES_AFTER_LOADING[numChangesAfterLoading]) {
-        numChangesAfterLoading++;
-        return;
-    }
-    numChangesAfterLoading = NUM_CHANGES_AFTER_LOADING;
-    kernel.getAs<IntegrateVRattleStepKernel>().stateChanged();
+void VariableStepRattleIntegrator::stateChanged(State::DataType) {
+    run->stateChanged();
 }
 
 double VariableStepRattleIntegrator::computeKineticEnergy() {
-    return kernel.getAs<IntegrateVRattleStepKernel>().computeKineticEnergy(*context);
+    return run->getDevice().computeKineticEnergy();
 }
 
 bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
@@ -512,102 +515,69 @@ bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
 
 // ---------------------------------------------------------------------------------------------- saving and restoring
 
-VRattleRunState VariableStepRattleIntegrator::saveRun() const {
-    OpenMM::Kernel& stateful = const_cast<OpenMM::Kernel&>(kernel);
-    VRattleRunState run = stateful.getAs<IntegrateVRattleStepKernel>().saveRun(*context, *this);
-    run.lastStepSize = lastStepSize;
-    return run;
-}
-
-void VariableStepRattleIntegrator::copySettings(const VariableStepRattleIntegrator& other) {
-    nominalStepSize = other.nominalStepSize;
-    Integrator::setStepSize(nominalStepSize);
-    minimumStepSize = other.minimumStepSize;
-    maximumStepSize = other.maximumStepSize;
-    updateMethod = other.updateMethod;
-    monitors = other.monitors;
-    monitorForceGroup = other.monitorForceGroup;
-    normOrder = other.normOrder;
-    automatic = other.automatic;
-    calibrationSteps = other.calibrationSteps;
-    std::copy(std::begin(other.automaticReferences), std::end(other.automaticReferences), automaticReferences);
-    Integrator::setConstraintTolerance(other.getConstraintTolerance());
-    setIntegrationForceGroups(other.getIntegrationForceGroups());
-    settingsChanged();
-}
-
-void VariableStepRattleIntegrator::resumeRun(const VariableStepRattleIntegrator& saved, const VRattleRunState& run) {
-    VariableStepRattleIntegrator previous(nominalStepSize);
-    previous.copySettings(*this);
-    const vector<ExpressionConstraint> previousConstraints = expressionConstraints;
+void VariableStepRattleIntegrator::resume(const IntegratorSettings& saved, RunState& state) {
+    const IntegratorSettings previous = *settings;
+    IntegratorSettings next = saved;
+    next.automaticRequest = previous.automaticRequest;
+    if (!next.hasSameConstraints(previous)) // the constraints are those of the Context, their parameters the saved ones
+        next.expressions = previous.expressions;
+    next.fitDefaultMonitor(hasConstraints(context->getSystem(), next));
+    if (next.isDefaultMonitor && next.monitors[0].kind != saved.monitors[0].kind)
+        state.references.clear();
+    run->requireUsable(state, next);
+    takeOver(next);
     try {
-        copyExpressionParameters(saved);
-        copySettings(saved);
-        kernel.getAs<IntegrateVRattleStepKernel>().resumeRun(*context, *this, run);
-        lastStepSize = run.lastStepSize;
+        run->resume(state);
     }
     catch (...) {
-        expressionConstraints = previousConstraints;
-        copySettings(previous);
+        takeOver(previous);
         throw;
     }
 }
 
 void VariableStepRattleIntegrator::createCheckpoint(std::ostream& stream) const {
-    std::ostringstream settings, data;
-    XmlSerializer::serialize(this, "Integrator", settings);
-    const string text = settings.str();
-    const long long length = (long long) text.size();
+    std::ostringstream text, data;
+    XmlSerializer::serialize(this, "Integrator", text);
+    const long long length = (long long) text.str().size();
     data.write(reinterpret_cast<const char*>(&length), sizeof(length));
-    data.write(text.data(), length);
-    saveRun().write(data);
+    data.write(text.str().data(), length);
+    const RunState state = run->save();
+    state.write(data);
     CheckpointBlock::write(stream, data.str());
-    reinitializationPhase = CheckpointWritten;
+    lastSaved = state.context;
 }
 
 void VariableStepRattleIntegrator::loadCheckpoint(std::istream& stream) {
-    const bool isReinitializing = reinitializationPhase == CleanedUp;
-    reinitializationPhase = None;
-    try {
-        std::istringstream data(CheckpointBlock::read(stream));
-        long long length = 0;
-        data.read(reinterpret_cast<char*>(&length), sizeof(length));
-        string text(length, ' ');
-        data.read(&text[0], length);
-        std::istringstream settings(text);
-        std::unique_ptr<VariableStepRattleIntegrator> saved(
-            XmlSerializer::deserialize<VariableStepRattleIntegrator>(settings));
-        VRattleRunState run;
-        run.read(data);
-        // Whoever has changed the masses or constraints calls reinitialize(), and may keep the positions.
-        const bool isSameSystem = run.system == kernel.getAs<IntegrateVRattleStepKernel>().getSystemFingerprint();
-        if (!isSameSystem && !isReinitializing)
-            throw OpenMMException(
-                "VariableStepRattleIntegrator: this checkpoint was made with another System, whose "
-                "masses or constraints are not those of this one; load it into a Context of that System");
-        resumeRun(*saved, run);
-        numChangesAfterLoading = 0;
-    }
-    catch (...) {
-        // The positions of the Context are those of the checkpoint by now.
-        kernel.getAs<IntegrateVRattleStepKernel>().stateChanged();
-        throw;
-    }
+    run->stateChanged();
+    string block;
+    if (!CheckpointBlock::read(stream, block))
+        return; // it was written under another integrator
+    std::istringstream data(block);
+    long long length = 0;
+    data.read(reinterpret_cast<char*>(&length), sizeof(length));
+    string text(length, ' ');
+    data.read(&text[0], length);
+    std::istringstream xml(text);
+    std::unique_ptr<VariableStepRattleIntegrator> saved(XmlSerializer::deserialize<VariableStepRattleIntegrator>(xml));
+    RunState state;
+    state.read(data);
+    // Whoever has changed the masses or constraints calls Context::reinitialize(), which loads what was saved just before.
+    if (state.system != run->getSystemFingerprint() && state.context != lastSaved)
+        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint was made with another System, whose "
+                              "masses or constraints are not those of this one; load it into a Context of that System");
+    resume(*saved->settings, state);
 }
 
 void VariableStepRattleIntegrator::serializeParameters(SerializationNode& node) const {
     node.setIntProperty("version", PARAMETERS_VERSION);
     node.setStringProperty("integrator", TYPE_NAME);
     node.createChildNode("Settings", this);
-    saveRun().write(node.createChildNode("Run"));
+    run->save().write(node.createChildNode("Run"));
 }
 
 void VariableStepRattleIntegrator::deserializeParameters(const SerializationNode& node) {
-    if (node.getProperties().empty() && node.getChildren().empty())
-        return; // of an integrator without parameters: there is nothing to go on from
     if (node.getStringProperty("integrator", "") != TYPE_NAME)
-        throw OpenMMException("VariableStepRattleIntegrator: the State holds the parameters of another integrator; "
-                              "make it without them, by getState(integratorParameters=False)");
+        return; // they are another integrator's, or there are none
     const int version = node.getIntProperty("version");
     if (version != PARAMETERS_VERSION)
         throw OpenMMException("VariableStepRattleIntegrator: the State holds parameters in version " +
@@ -615,47 +585,22 @@ void VariableStepRattleIntegrator::deserializeParameters(const SerializationNode
                               std::to_string(PARAMETERS_VERSION) + "; use the version of the plugin that wrote them");
     std::unique_ptr<VariableStepRattleIntegrator> saved(
         node.getChildNode("Settings").decodeObject<VariableStepRattleIntegrator>());
-    VRattleRunState run;
-    run.read(node.getChildNode("Run"));
-    resumeRun(*saved, run);
-}
-
-void VariableStepRattleIntegrator::settingsChanged() {
-    if (context != NULL)
-        kernel.getAs<IntegrateVRattleStepKernel>().settingsChanged();
-}
-
-void VariableStepRattleIntegrator::requireContext() const {
-    if (context == NULL)
-        throw OpenMMException("This Integrator is not bound to a context!");
+    RunState state;
+    state.read(node.getChildNode("Run"));
+    resume(*saved->settings, state);
 }
 
 void VariableStepRattleIntegrator::checkMonitorIndex(int index) const {
-    if (index < 0 || index >= (int) monitors.size())
+    if (index < 0 || index >= getNumMonitors())
         throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
-                              "; the integrator has " + std::to_string(monitors.size()));
+                              "; the integrator has " + std::to_string(getNumMonitors()));
 }
 
 // Of what has a value and a reference value: the monitors, or the two of automatic step control.
 void VariableStepRattleIntegrator::checkReferenceIndex(int index) const {
-    if (!automatic)
+    if (!settings->isAutomatic)
         checkMonitorIndex(index);
-    else if (index < 0 || index >= NUM_AUTOMATIC_MONITORS)
+    else if (index < 0 || index >= settings->getNumReferences())
         throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
                               "; automatic step control has two, 0 and 1");
-}
-
-void VariableStepRattleIntegrator::checkBounds(double nominal, double minimum, double maximum) const {
-    if (minimum > 0 && minimum >= nominal) {
-        std::stringstream message;
-        message << "VariableStepRattleIntegrator: the minimum step size (" << minimum
-                << " ps) must be smaller than the nominal one (" << nominal << " ps)";
-        throw OpenMMException(message.str());
-    }
-    if (maximum > 0 && maximum <= nominal) {
-        std::stringstream message;
-        message << "VariableStepRattleIntegrator: the maximum step size (" << maximum
-                << " ps) must be larger than the nominal one (" << nominal << " ps)";
-        throw OpenMMException(message.str());
-    }
 }

@@ -9,7 +9,7 @@
 
 Every function adds one or more expressions with `VariableStepRattleIntegrator.addConstraint()` and returns what that
 returns: the index of the constraint, or a tuple of indices. With an index, `getExpressionConstraintMultiplier()` gives
-the force that holds the constraint, and `setExpressionConstraintParameter()` changes the value at which it is held,
+the force that holds the constraint, and `setExpressionParameterValue()` changes the value at which it is held,
 whose name each function gives. Lengths are in nm and angles in radians, or Quantities.
 
 The multiplier is the generalised force along the constrained quantity q: the force on a particle is minus the

@@ -64,7 +64,7 @@ def test_what_was_added_can_be_read() -> None:
     assert integrator.getExpressionConstraintParameters(0) == ("x1-x2-d", [3, 1], {"d": pytest.approx(0.02)})
     assert integrator.getExpressionConstraintParameters(1)[2] == {"angle": pytest.approx(np.pi), "k": 2.0}
     assert integrator.getExpressionConstraintParameters(np.int64(2)) == ("z1", [5], {})
-    integrator.setExpressionConstraintParameter(0, "d", 1 * unit.nanometer)
+    integrator.setExpressionParameterValue(0, "d", 1 * unit.nanometer)
     assert integrator.getExpressionConstraintParameters(0)[2] == {"d": 1.0}
     integrator.setExpressionConstraintParameters(2, "z1+k", [6], parameters={"k": 3})
     assert integrator.getExpressionConstraintParameters(2) == ("z1+k", [6], {"k": 3.0})
@@ -126,12 +126,12 @@ def test_indices_and_names_that_are_not_there() -> None:
         for call in (
             lambda i=index: integrator.getExpressionConstraintParameters(i),
             lambda i=index: integrator.setExpressionConstraintParameters(i, "x1", [0]),
-            lambda i=index: integrator.setExpressionConstraintParameter(i, "k", 1),
+            lambda i=index: integrator.setExpressionParameterValue(i, "k", 1),
         ):
             with pytest.raises(openmm.OpenMMException, match=f"no expression constraint with index {index}"):
                 call()
     with pytest.raises(openmm.OpenMMException, match="has no parameter q"):
-        integrator.setExpressionConstraintParameter(0, "q", 1)
+        integrator.setExpressionParameterValue(0, "q", 1)
     with pytest.raises(openmm.OpenMMException, match="not bound to a context"):
         integrator.getExpressionConstraintMultiplier(0)
 
@@ -405,7 +405,7 @@ def test_where_nothing_pulls_there_is_no_measure() -> None:
 def test_a_new_value_takes_effect_at_once(platform: str) -> None:
     integrator, context = on_sphere(platform=platform)
     integrator.step(20)
-    integrator.setExpressionConstraintParameter(0, "r", 1.1 * unit.nanometer)
+    integrator.setExpressionParameterValue(0, "r", 1.1 * unit.nanometer)
     before = positions_of(context)[0]
     # The run starts afresh from the nearest position, at which the multiplier is known without a step.
     v = velocities_of(context)[0]
@@ -424,7 +424,7 @@ def test_an_old_value_changes_nothing() -> None:
         integrator, context = on_sphere()
         integrator.step(20)
         if is_set:
-            integrator.setExpressionConstraintParameter(0, "r", 1.0)
+            integrator.setExpressionParameterValue(0, "r", 1.0)
         integrator.step(20)
         ends.append(state_of(context))
     np.testing.assert_array_equal(ends[0], ends[1])
@@ -434,7 +434,7 @@ def test_a_new_value_is_used_by_a_calibration() -> None:
     integrator, context = on_sphere()
     values = []
     for radius in (1.0, 2.0, 1.0):
-        integrator.setExpressionConstraintParameter(0, "r", radius)
+        integrator.setExpressionParameterValue(0, "r", radius)
         integrator.calibrate(20)
         values.append(integrator.getReferenceMonitorValue())
     assert values[0] == pytest.approx(values[2], rel=1e-9)

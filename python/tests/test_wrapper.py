@@ -122,6 +122,7 @@ def test_the_public_methods_are_those_of_the_interface():
         "getMinimumStepSize",
         "getMonitor",
         "getMonitorForceGroup",
+        "getMonitorNormOrder",
         "getMonitorValue",
         "getMultipliers",
         "getNominalStepSize",
@@ -155,7 +156,7 @@ def test_defaults_in_signatures():
     def defaults(method):
         return {p.name: p.default for p in inspect.signature(method).parameters.values() if p.default is not p.empty}
 
-    assert defaults(VariableStepRattleIntegrator.addMonitor) == {"weight": 1.0, "power": 1.0}
+    assert defaults(VariableStepRattleIntegrator.addMonitor) == {"weight": 1.0, "power": 1.0, "order": 0.0}
     assert defaults(VariableStepRattleIntegrator.getReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.setReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.getMonitorValue) == {"index": 0}

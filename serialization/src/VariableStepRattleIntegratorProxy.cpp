@@ -5,6 +5,7 @@
 #include "openmm/OpenMMException.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "run/IntegratorSettings.h"
 #include <map>
 #include <memory>
 #include <string>
@@ -17,22 +18,19 @@ using OpenMM::SerializationProxy;
 
 namespace {
 
-const int VERSION = 2; // 2: automatic step control, constraints by expressions
+const int VERSION =
+    3; // 2: automatic step control, constraints by expressions; 3: default monitor, order of each monitor
 const char MINIMUM_STEP[] = "minimumStepSize", MAXIMUM_STEP[] = "maximumStepSize";
 const char AUTOMATIC_CONTROL[] = "AutomaticStepControl", EXPRESSION_CONSTRAINTS[] = "ExpressionConstraints";
 const char* const AUTOMATIC_REFERENCES[] = {"onStepReference", "halfStepReference"};
 
-void writeExpressionConstraints(const VariableStepRattleIntegrator& integrator, SerializationNode& node) {
-    for (int i = 0; i < integrator.getNumExpressionConstraints(); i++) {
-        std::string expression;
-        std::vector<int> particles;
-        std::map<std::string, double> parameters;
-        integrator.getExpressionConstraintParameters(i, expression, particles, parameters);
+void writeExpressionConstraints(const IntegratorSettings& settings, SerializationNode& node) {
+    for (const ExpressionConstraint& each : settings.expressions) {
         SerializationNode& constraint = node.createChildNode("Constraint");
-        constraint.setStringProperty("expression", expression);
-        for (int particle : particles)
+        constraint.setStringProperty("expression", each.expression);
+        for (int particle : each.particles)
             constraint.createChildNode("Particle").setIntProperty("index", particle);
-        for (const auto& parameter : parameters)
+        for (const auto& parameter : each.parameters)
             constraint.createChildNode("Parameter")
                 .setStringProperty("name", parameter.first)
                 .setDoubleProperty("value", parameter.second);
@@ -60,37 +58,38 @@ VariableStepRattleIntegratorProxy::VariableStepRattleIntegratorProxy() :
 }
 
 void VariableStepRattleIntegratorProxy::serialize(const void* object, SerializationNode& node) const {
-    const VariableStepRattleIntegrator& integrator = *static_cast<const VariableStepRattleIntegrator*>(object);
+    const IntegratorSettings& settings = *static_cast<const VariableStepRattleIntegrator*>(object)->settings;
     node.setIntProperty("version", VERSION);
-    node.setDoubleProperty("stepSize", integrator.getNominalStepSize());
-    if (integrator.hasMinimumStepSize())
-        node.setDoubleProperty(MINIMUM_STEP, integrator.getMinimumStepSize());
-    if (integrator.hasMaximumStepSize())
-        node.setDoubleProperty(MAXIMUM_STEP, integrator.getMaximumStepSize());
-    node.setDoubleProperty("constraintTolerance", integrator.getConstraintTolerance());
-    node.setIntProperty("integrationForceGroups", integrator.getIntegrationForceGroups());
-    node.setIntProperty("updateMethod", integrator.getUpdateMethod());
-    node.setDoubleProperty("normOrder", integrator.getNormOrder());
-    node.setIntProperty("monitorForceGroup", integrator.getMonitorForceGroup());
+    node.setDoubleProperty("stepSize", settings.stepSize);
+    if (settings.minimumStep != IntegratorSettings::USE_DEFAULT)
+        node.setDoubleProperty(MINIMUM_STEP, settings.minimumStep);
+    if (settings.maximumStep != IntegratorSettings::USE_DEFAULT)
+        node.setDoubleProperty(MAXIMUM_STEP, settings.maximumStep);
+    node.setDoubleProperty("constraintTolerance", settings.constraintTolerance);
+    node.setIntProperty("integrationForceGroups", settings.forceGroups);
+    node.setIntProperty("updateMethod", settings.update);
+    node.setDoubleProperty("normOrder", settings.normOrder);
+    node.setIntProperty("monitorForceGroup", settings.monitorForceGroup);
     SerializationNode& monitors = node.createChildNode("Monitors");
-    for (int i = 0; i < integrator.getNumMonitors(); i++) {
-        VariableStepRattleIntegrator::MonitorKind kind;
-        double weight, power;
-        integrator.getMonitor(i, kind, weight, power);
-        SerializationNode& monitor = monitors.createChildNode("Monitor");
-        monitor.setIntProperty("kind", kind).setDoubleProperty("weight", weight).setDoubleProperty("power", power);
-        monitor.setDoubleProperty("reference", integrator.getSetReferenceMonitorValue(i));
-    }
-    if (integrator.isAutomatic()) {
+    monitors.setBoolProperty("areDefault", settings.isDefaultMonitor);
+    for (const StepMonitor::Term& monitor : settings.monitors)
+        monitors.createChildNode("Monitor")
+            .setIntProperty("kind", monitor.kind)
+            .setDoubleProperty("weight", monitor.weight)
+            .setDoubleProperty("power", monitor.power)
+            .setDoubleProperty("order", monitor.order)
+            .setDoubleProperty("reference", monitor.reference);
+    if (settings.isAutomatic) {
         SerializationNode& automatic = node.createChildNode(AUTOMATIC_CONTROL);
-        automatic.setIntProperty("calibrationSteps", integrator.getCalibrationSteps());
-        for (int k = 0; k < 2; k++)
-            automatic.setDoubleProperty(AUTOMATIC_REFERENCES[k], integrator.getSetReferenceMonitorValue(k));
+        automatic.setIntProperty("calibrationSteps", settings.calibrationSteps);
+        for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
+            automatic.setDoubleProperty(AUTOMATIC_REFERENCES[k], settings.automaticReferences[k]);
     }
-    if (integrator.getNumExpressionConstraints() > 0)
-        writeExpressionConstraints(integrator, node.createChildNode(EXPRESSION_CONSTRAINTS));
+    if (!settings.expressions.empty())
+        writeExpressionConstraints(settings, node.createChildNode(EXPRESSION_CONSTRAINTS));
 }
 
+// Through the integrator's functions, which refuse what is wrong.
 void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& node) const {
     const int version = node.getIntProperty("version");
     if (version < 1 || version > VERSION)
@@ -108,17 +107,21 @@ void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& no
     integrator->setUpdateMethod((VariableStepRattleIntegrator::UpdateMethod) node.getIntProperty("updateMethod"));
     integrator->setNormOrder(node.getDoubleProperty("normOrder"));
     integrator->setMonitorForceGroup(node.getIntProperty("monitorForceGroup"));
+    const SerializationNode& monitors = node.getChildNode("Monitors");
     integrator->clearMonitors();
-    for (const SerializationNode& monitor : node.getChildNode("Monitors").getChildren()) {
+    for (const SerializationNode& monitor : monitors.getChildren()) {
         const auto kind = (VariableStepRattleIntegrator::MonitorKind) monitor.getIntProperty("kind");
         const int index =
-            integrator->addMonitor(kind, monitor.getDoubleProperty("weight"), monitor.getDoubleProperty("power"));
+            integrator->addMonitor(kind, monitor.getDoubleProperty("weight"), monitor.getDoubleProperty("power"),
+                                   monitor.getDoubleProperty("order", 0.0));
         integrator->setReferenceMonitorValue(monitor.getDoubleProperty("reference"), index);
     }
+    integrator->settings->isDefaultMonitor =
+        monitors.getBoolProperty("areDefault", false) && integrator->getNumMonitors() == 1;
     for (const SerializationNode& child : node.getChildren()) {
         if (child.getName() == AUTOMATIC_CONTROL) {
             integrator->useAutomaticStepControl(child.getIntProperty("calibrationSteps"));
-            for (int k = 0; k < 2; k++)
+            for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
                 integrator->setReferenceMonitorValue(child.getDoubleProperty(AUTOMATIC_REFERENCES[k]), k);
         }
         else if (child.getName() == EXPRESSION_CONSTRAINTS)

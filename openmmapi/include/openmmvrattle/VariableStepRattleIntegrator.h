@@ -9,6 +9,7 @@
 #include "openmmvrattle/windowsExportVRattle.h"
 #include <iosfwd>
 #include <map>
+#include <memory>
 #include <set>
 #include <string>
 #include <tuple>
@@ -16,7 +17,9 @@
 
 namespace OpenMMVRattle {
 
-struct VRattleRunState;
+class IntegratorRun;
+struct IntegratorSettings;
+struct RunState;
 
 /**
  * An integrator for molecular dynamics with constraints whose step size varies and which is nevertheless
@@ -35,22 +38,31 @@ struct VRattleRunState;
  *
  * For most uses let the integrator choose its steps without a monitor of yours: useAutomaticStepControl().
  *
- * Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are
- * solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the
- * tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
+ * Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run, and after each
+ * change of the state by the user or by a Force that moves particles (a barostat); one more where the first step is taken with a given
+ * reference value, since that step is then taken twice; one after loading a checkpoint or a State, to compare the forces with the
+ * saved ones; and the trial steps of calibrate() and of automatic step control. A monitor ForceGroupEnergy costs the energy
+ * of its group on top of each. getNumForceEvaluations() counts all.
+ *
+ * The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to
+ * the tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
  * getMultipliers().
  *
  * The velocities in the Context belong to the same time as the positions, and satisfy the velocity constraints: kinetic
- * plus potential energy of a State is the energy at that time.
+ * plus potential energy of a State is the energy at that time. Forces that depend on the time or the step count see those of the end of
+ * the step when they are computed there.
  *
- * A step that cannot be completed throws an OpenMMException and leaves the Context in the state before that step.
+ * A step that cannot be completed throws an OpenMMException and leaves the Context in the state before that step: a run that goes
+ * on from there, with other settings perhaps, is the one that it would be if that step had never been tried.
  *
  * OpenMM's XmlSerializer stores all settings. Checkpoints, and States made with integrator parameters, store the
  * settings and everything else that the next step depends on, and loading one brings all of it back, the settings as
  * well: a run that goes on from a checkpoint is the same to the last bit on the Reference platform, and from a State to
  * rounding. At the first step after that the forces are computed once more. If they are not those of the saved run,
- * because a Force has been changed in the meantime, or if a State's positions or velocities are not the Context's, the
- * run starts afresh with the saved reference values.
+ * because a Force has been changed in the meantime, or if a State's positions, velocities, box vectors or parameters are not the
+ * Context's, the run starts afresh with the saved reference values. States and checkpoints that were written under another integrator load
+ * as well: positions, velocities, time and parameters are taken, the settings stay as they are, and the run starts
+ * afresh.
  *
  * Drude particles are refused, for they need an integrator that keeps them at their energy minimum or at a temperature
  * of their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter
@@ -80,9 +92,9 @@ public:
         AppliedForce = 2,
         /** sqrt(Lambda^T K Lambda + sum |F|^2/m), in nm amu^(1/2)/ps^2. */
         ConstraintAndAppliedForce = 3,
-        /** The p-norm of the multipliers, in kJ/mol/nm^2; see setNormOrder(). */
+        /** The p-norm of the multipliers, in kJ/mol/nm^2; see addMonitor(). */
         MultiplierPNorm = 4,
-        /** The p-norm over the particles of |F|, in kJ/mol/nm; see setNormOrder(). */
+        /** The p-norm over the particles of |F|, in kJ/mol/nm; see addMonitor(). */
         ForcePNorm = 5,
         /** U1 (4.1): sqrt(sum m |v|^2 + sum |F|^2), in OpenMM's units. */
         VectorField = 6,
@@ -96,29 +108,33 @@ public:
         ForceGroupEnergy = 10
     };
     /**
-     * Create a VariableStepRattleIntegrator with one monitor, ConstraintMultipliers.
+     * Create a VariableStepRattleIntegrator with one monitor: ConstraintMultipliers, or in a System without constraints
+     * ConstraintAndAppliedForce.
      *
-     * @param stepSize    the nominal step size, taken where the monitor has its reference value (in ps)
+     * @param stepSize    the nominal step size, taken where the monitor has its reference value (in ps). With 0 no step can be taken,
+     *                    which will do for a Context that computes energies
      */
     explicit VariableStepRattleIntegrator(double stepSize);
+    /** Create one with the settings of another, and no Context. */
+    VariableStepRattleIntegrator(const VariableStepRattleIntegrator& other);
+    ~VariableStepRattleIntegrator() override;
     /** Get the nominal step size: the step taken where the monitor has its reference value (in ps). */
     double getNominalStepSize() const;
     /**
-     * Set the nominal step size: the step taken where the monitor has its reference value. It must be positive, and lie
-     * between the step bounds where these have been set. In the course of a run the density is kept, so the steps
-     * change in proportion.
+     * Set the nominal step size: the step taken where the monitor has its reference value. Where step bounds have been set it must lie
+     * between them when the next step is taken; the three can be set in any order. In the course of a run the density is kept, so the
+     * steps change in proportion.
      *
-     * @param size    the nominal step size, measured in ps
+     * @param size    the nominal step size, measured in ps; 0 where no step is to be taken
      */
     void setNominalStepSize(double size);
-    /** Get the size of the most recent step, or the nominal step size before the first step (in ps). */
+    /**
+     * Get the size of the most recent step (in ps); before the first step, and when the nominal step size has been set since, the
+     * nominal one.
+     */
     double getStepSize() const override;
     /** The same as setNominalStepSize(), so that scripts written for a fixed step keep working. */
     void setStepSize(double size) override;
-    /** Get whether a minimum step size was set; if not, it follows the nominal step size. */
-    bool hasMinimumStepSize() const;
-    /** Get whether a maximum step size was set; if not, it follows the nominal step size. */
-    bool hasMaximumStepSize() const;
     /** Get the smallest step size the monitor can ask for (in ps), or 0 if there is no bound. */
     double getMinimumStepSize() const;
     /**
@@ -126,7 +142,7 @@ public:
      * oscillates slightly about u and steps may leave the bounds by as much; where the motion is not resolved they may
      * leave them by more. Default: 1/50 of the nominal step size.
      *
-     * @param size    the bound in ps, smaller than the nominal step size; 0 means no bound
+     * @param size    the bound in ps; 0 means no bound. It must be smaller than the nominal step size when the next step is taken
      */
     void setMinimumStepSize(double size);
     /** Get the largest step size the monitor can ask for (in ps), or 0 if there is no bound. */
@@ -136,7 +152,7 @@ public:
      * larger, with the others a step of more than twice the bound is rescued (see getNumRescues()). Default: twice the
      * nominal step size.
      *
-     * @param size    the bound in ps, larger than the nominal step size; 0 means no bound
+     * @param size    the bound in ps; 0 means no bound. It must be larger than the nominal step size when the next step is taken
      */
     void setMaximumStepSize(double size);
     /** Get the recursion of the step density. */
@@ -150,9 +166,11 @@ public:
      * @param kind      what the monitor measures
      * @param weight    its weight w_k > 0 in the combination; of no effect on a single monitor
      * @param power     the positive power to which U_k/U_k,ref is raised
+     * @param order     the order p, at least 1, of MultiplierPNorm and ForcePNorm; of no meaning to others. 0, the default, stands
+     *                  for getNormOrder(), which is 8
      * @return the index of the monitor
      */
-    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0);
+    int addMonitor(MonitorKind kind, double weight = 1.0, double power = 1.0, double order = 0.0);
     /**
      * Remove all monitors, and end automatic step control. With none the step is fixed at the nominal size: plain RATTLE
      * (3.1-3.5).
@@ -169,11 +187,14 @@ public:
      * @param[out] power     the power to which it is raised
      */
     void getMonitor(int index, MonitorKind& kind, double& weight, double& power) const;
+    /** Get the order p of a monitor, which is that of a norm if it is MultiplierPNorm or ForcePNorm. */
+    double getMonitorNormOrder(int index) const;
     /** Get the force group whose energy the monitor ForceGroupEnergy uses. */
     int getMonitorForceGroup() const;
     /**
      * Set the force group whose potential energy is the monitor ForceGroupEnergy: a positive function of the positions
-     * that is written as an OpenMM Force. While such a monitor exists, the group is left out of the dynamics.
+     * that is written as an OpenMM Force. While such a monitor exists, the group is left out of the dynamics, and
+     * getIntegrationForceGroups() does not contain it: it is no part of the energy.
      *
      * @param group    the force group, between 0 and 31. Default: 31
      */
@@ -205,13 +226,16 @@ public:
     bool isAutomatic() const;
     /** Get the number of trial steps of the automatic step control, as it was set last. */
     int getCalibrationSteps() const;
-    /** Get how often useAutomaticStepControl() has been called. Used by the platforms. */
-    int getNumAutomaticRequests() const;
-    /** Get the order p of the monitors MultiplierPNorm and ForcePNorm. */
+    /**
+     * Get the order of norms that addMonitor() gives to monitors that are added without one.
+     *
+     * @deprecated use getMonitorNormOrder()
+     */
     double getNormOrder() const;
     /**
-     * Set the order p of the monitors MultiplierPNorm and ForcePNorm.
+     * Set the order of all monitors MultiplierPNorm and ForcePNorm, also of those that are added later without one.
      *
+     * @deprecated give it to addMonitor()
      * @param order    the order, at least 1. Default: 8
      */
     void setNormOrder(double order);
@@ -219,20 +243,21 @@ public:
      * Get the reference value U_ref of a monitor: where U equals it, the nominal step size is taken.
      *
      * @param index    the index of the monitor
-     * @return the value in force; 0 if none was set and no step has been taken
+     * @return the value in force; 0 if none was set and no step has been taken that could tell
      */
     double getReferenceMonitorValue(int index = 0) const;
     /**
      * Set the reference value U_ref of a monitor. 0 (the default) means that it is taken at the first step: the first
      * step then has the nominal size, and U_ref is the value of U that makes the sequence of densities start without
-     * oscillation, which is U at the start up to the change of U over a half step.
+     * oscillation, which is U at the start up to the change of U over a half step. While the monitor is zero but for rounding, as
+     * that of the constraint forces where nothing pulls and nothing turns, it asks for nothing: steps have the nominal size, and
+     * the reference value is taken at the first step after that. Where that is no good measure for the rest of the run, set one, or
+     * call calibrate() later.
      *
      * @param value    the reference value in the monitor's unit, or 0
      * @param index    the index of the monitor
      */
     void setReferenceMonitorValue(double value, int index = 0);
-    /** Get the reference value that was set for a monitor; 0 if it is to be taken at the first step. */
-    double getSetReferenceMonitorValue(int index) const;
     /**
      * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size, or of the two of
      * automatic step control to their geometric means. The
@@ -273,13 +298,14 @@ public:
     double getExpressionConstraintMultiplier(int index) const;
     /**
      * Get how often the forces have been computed for this integrator since the Context was created or reinitialized.
-     * This and the following counts go on when a checkpoint or a State is loaded.
+     * This and the following counts are of the work done in this Context: they are not saved, and loading a checkpoint or a State
+     * leaves them as they are.
      */
     long long getNumForceEvaluations() const;
-    /** Get how many iterations the solver of the constraints has taken since the Context was created. */
+    /** Get how many iterations the solver of the constraints has taken since then, those of trial steps among them. */
     long long getNumSolverIterations() const;
     /**
-     * Get how many steps since the Context was created had to be rescued: the sum update gave no positive density, a
+     * Get how many steps since then had to be rescued: the sum update gave no positive density, a
      * step of more than twice the maximum, or equations that could not be solved, and the density of the update Bounded
      * was taken for that one step. The run goes on, but it is not exactly reversible across a rescued step. A number that
      * grows says that the nominal step size is too large.
@@ -296,6 +322,9 @@ public:
      * @param tol    the tolerance; positive and finite
      */
     void setConstraintTolerance(double tol) override;
+    /** Get the force groups that act, a bit for each: those that were set, without that of a monitor ForceGroupEnergy. */
+    int getIntegrationForceGroups() const override;
+    void setIntegrationForceGroups(int groups) override;
     /**
      * Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm, which are
      * called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters of this constraint, which
@@ -353,6 +382,12 @@ public:
      * @param name     the name of the parameter
      * @param value    its new value
      */
+    void setExpressionParameterValue(int index, const std::string& name, double value);
+    /**
+     * The same as setExpressionParameterValue().
+     *
+     * @deprecated its name differs by one letter from that of another function
+     */
     void setExpressionConstraintParameter(int index, const std::string& name, double value);
     /**
      * Advance the simulation by a number of steps.
@@ -388,49 +423,23 @@ protected:
     void deserializeParameters(const OpenMM::SerializationNode& node) override;
 
 private:
-    struct Monitor {
-        MonitorKind kind;
-        double weight, power, reference;
-    };
-    struct ExpressionConstraint {
-        std::string expression;
-        std::vector<int> particles;
-        std::map<std::string, double> parameters;
-    };
+    friend class VariableStepRattleIntegratorProxy;
     void settingsChanged();
-    ExpressionConstraint checkConstraint(const std::string& expression, const std::vector<int>& particles,
-                                         const std::map<std::string, double>& parameters);
+    void takeOver(const IntegratorSettings& newSettings);
+    void checkConstraint(const std::string& expression, const std::vector<int>& particles,
+                         const std::map<std::string, double>& parameters);
     void checkExpressionConstraintIndex(int index) const;
     void checkExpressionConstraints(const OpenMM::ContextImpl& context) const;
-    void copyExpressionParameters(const VariableStepRattleIntegrator& other);
-    void requireContext() const;
     void checkMonitorIndex(int index) const;
     void checkReferenceIndex(int index) const;
-    void checkBounds(double nominal, double minimum, double maximum) const;
-    double advance(double maxTime);
-    VRattleRunState saveRun() const;
-    void resumeRun(const VariableStepRattleIntegrator& saved, const VRattleRunState& run);
-    void copySettings(const VariableStepRattleIntegrator& other);
-    double nominalStepSize, lastStepSize;
-    // The bounds in ps; a negative number stands for the default, which follows the nominal step size.
-    double minimumStepSize, maximumStepSize;
-    UpdateMethod updateMethod;
-    std::vector<Monitor> monitors;
-    int monitorForceGroup;
-    double normOrder;
-    // Automatic step control: 0 trial steps while it is off; references as those of the monitors.
-    bool automatic;
-    int calibrationSteps, numAutomaticRequests;
-    double automaticReferences[2];
-    std::vector<ExpressionConstraint> expressionConstraints;
+    IntegratorRun& requireRun() const;
+    void resume(const IntegratorSettings& saved, RunState& state);
+    std::unique_ptr<IntegratorSettings> settings;
+    OpenMM::Kernel kernel;
+    std::unique_ptr<IntegratorRun> run; // in the Context, as long as there is one
+    mutable unsigned long long lastSaved; // fingerprint of the Context in the last checkpoint
     // What has been found to be right: expression, number of particles and names of the parameters.
     std::set<std::tuple<std::string, size_t, std::vector<std::string>>> checkedExpressions;
-    OpenMM::Kernel kernel;
-    // Context::reinitialize() writes a checkpoint, cleans up, and loads it: how far this has gone.
-    enum ReinitializationPhase { None, CheckpointWritten, CleanedUp };
-    mutable ReinitializationPhase reinitializationPhase;
-    // How many of the changes that OpenMM announces after it has loaded a checkpoint have come.
-    int numChangesAfterLoading;
 };
 
 } // namespace OpenMMVRattle

@@ -1,9 +1,9 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "CheckpointBlock.h"
+#include "run/CheckpointBlock.h"
 #include "openmm/OpenMMException.h"
-#include "openmmvrattle/Fingerprint.h"
+#include "run/Fingerprint.h"
 #include <algorithm>
 #include <cstring>
 #include <istream>
@@ -16,7 +16,7 @@ using std::string;
 namespace {
 
 const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
-const int VERSION = 1;
+const int VERSION = 2; // 2: fingerprints of box and parameters, no force groups
 const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
 
 unsigned long long fingerprintOf(const string& data) {
@@ -41,28 +41,34 @@ void CheckpointBlock::write(std::ostream& stream, const string& data) {
     stream.write(data.data(), length);
 }
 
-string CheckpointBlock::read(std::istream& stream) {
+bool CheckpointBlock::read(std::istream& stream, string& data) {
+    const std::istream::pos_type start = stream.tellg();
     char mark[sizeof(MARK)];
-    if (!stream.read(mark, sizeof(MARK)) || std::memcmp(mark, MARK, sizeof(MARK)) != 0)
-        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint was not made with a "
-                              "VariableStepRattleIntegrator, so the run cannot go on from it");
+    stream.read(mark, sizeof(MARK));
+    const size_t length = (size_t) stream.gcount();
+    if (length == 0 || std::memcmp(mark, MARK, length) != 0) {
+        stream.clear();
+        if (start != std::istream::pos_type(-1))
+            stream.seekg(start);
+        return false;
+    }
     int version = 0;
     if (readValue(stream, version) && version != VERSION)
         throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is written in version " +
                               std::to_string(version) + " of its format and this plugin reads version " +
                               std::to_string(VERSION) + "; use the version of the plugin that wrote it");
-    long long length = 0;
+    long long numBytes = 0;
     unsigned long long fingerprint = 0;
-    string data;
-    if (readValue(stream, length) && readValue(stream, fingerprint)) {
-        while ((long long) data.size() < length && stream) {
-            const size_t size = data.size(), wanted = (size_t) std::min(CHUNK, length - (long long) size);
+    data.clear();
+    if (readValue(stream, numBytes) && readValue(stream, fingerprint)) {
+        while ((long long) data.size() < numBytes && stream) {
+            const size_t size = data.size(), wanted = (size_t) std::min(CHUNK, numBytes - (long long) size);
             data.resize(size + wanted);
             stream.read(&data[size], wanted);
             data.resize(size + (size_t) stream.gcount());
         }
     }
-    if (!stream || (long long) data.size() != length || fingerprintOf(data) != fingerprint)
+    if (!stream || (long long) data.size() != numBytes || fingerprintOf(data) != fingerprint)
         throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is damaged or cut short");
-    return data;
+    return true;
 }

@@ -19,9 +19,10 @@ public:
     /**
      * Read the data, and nothing beyond them.
      *
-     * @throws OpenMMException    if the stream holds something else, another version, or less than what was written
+     * @return whether there are any; if not, for the stream holds something else here or nothing, it is left where it was
+     * @throws OpenMMException    if they are of another version, or less than what was written
      */
-    static std::string read(std::istream& stream);
+    static bool read(std::istream& stream, std::string& data);
 };
 
 } // namespace OpenMMVRattle

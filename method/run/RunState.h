@@ -1,13 +1,12 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#ifndef OPENMMVRATTLE_VRATTLERUNSTATE_H_
-#define OPENMMVRATTLE_VRATTLERUNSTATE_H_
+#ifndef OPENMMVRATTLE_RUNSTATE_H_
+#define OPENMMVRATTLE_RUNSTATE_H_
 
 #include "openmm/System.h"
 #include "openmm/Vec3.h"
 #include "openmm/serialization/SerializationNode.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 #include <iosfwd>
 #include <map>
 #include <string>
@@ -15,7 +14,7 @@
 
 namespace OpenMMVRattle {
 
-class VariableStepRattleIntegrator;
+struct IntegratorSettings;
 
 /**
  * What a run needs to go on as if nothing had happened, beside the settings of the integrator and the positions,
@@ -24,10 +23,9 @@ class VariableStepRattleIntegrator;
  * The forces are in it to be compared with those at the restored positions: a State may be given to a Context whose
  * forces are others, and then the run must start afresh.
  */
-struct OPENMMVRATTLE_EXPORT VRattleRunState {
+struct RunState {
     /** Fingerprint of the masses and the constraints, but for the values of the parameters of expressions. */
-    static unsigned long long fingerprintOf(const OpenMM::System& system,
-                                            const VariableStepRattleIntegrator& integrator);
+    static unsigned long long fingerprintOf(const OpenMM::System& system, const IntegratorSettings& settings);
 
     /** Write or read everything, in binary form with a stream and as text with a SerializationNode. */
     void write(std::ostream& stream) const;
@@ -43,14 +41,13 @@ struct OPENMMVRATTLE_EXPORT VRattleRunState {
     }
 
     unsigned long long system = 0;     // fingerprint of the System
-    unsigned long long context = 0;    // fingerprint of the positions and velocities in the Context
+    unsigned long long context = 0;    // fingerprint of the Context: RunDevice::getFingerprint()
     double lastStepSize = 0;           // ps; 0 before the first step
     double lastDensity = 1;            // rho of the last step
     std::vector<double> references;    // U_k,ref in force, 0 if not known
     bool startsAfresh = true;          // no step since the user changed the state: nothing of what follows is there
 
-    int forceGroups = 0;               // those that act
-    // The numbers that the method goes on with, by names that the platform gives them.
+    // The numbers that the method goes on with, by names that the device gives them.
     std::map<std::string, std::vector<double>> methodValues;
     std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
     std::vector<OpenMM::Vec3> forces;  // F(q[n])
@@ -65,4 +62,4 @@ struct OPENMMVRATTLE_EXPORT VRattleRunState {
 
 } // namespace OpenMMVRattle
 
-#endif // OPENMMVRATTLE_VRATTLERUNSTATE_H_
+#endif // OPENMMVRATTLE_RUNSTATE_H_

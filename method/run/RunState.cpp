@@ -1,10 +1,10 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "openmmvrattle/VRattleRunState.h"
+#include "run/RunState.h"
 #include "openmm/OpenMMException.h"
-#include "openmmvrattle/Fingerprint.h"
-#include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "run/Fingerprint.h"
+#include "run/IntegratorSettings.h"
 #include <istream>
 #include <ostream>
 #include <string>
@@ -75,8 +75,7 @@ void readArray(const SerializationNode& node, const string& name, vector<Vec3>& 
 
 } // namespace
 
-unsigned long long VRattleRunState::fingerprintOf(const OpenMM::System& system,
-                                                  const VariableStepRattleIntegrator& integrator) {
+unsigned long long RunState::fingerprintOf(const OpenMM::System& system, const IntegratorSettings& settings) {
     Fingerprint fingerprint;
     for (int i = 0; i < system.getNumParticles(); i++)
         fingerprint.add(system.getParticleMass(i));
@@ -86,21 +85,17 @@ unsigned long long VRattleRunState::fingerprintOf(const OpenMM::System& system,
         system.getConstraintParameters(i, particle1, particle2, distance);
         fingerprint.add(Vec3(particle1, particle2, distance));
     }
-    for (int i = 0; i < integrator.getNumExpressionConstraints(); i++) {
-        string expression;
-        vector<int> particles;
-        std::map<string, double> parameters;
-        integrator.getExpressionConstraintParameters(i, expression, particles, parameters);
-        fingerprint.addBytes(expression.c_str(), expression.size() + 1);
-        for (int particle : particles)
+    for (const ExpressionConstraint& constraint : settings.expressions) {
+        fingerprint.addBytes(constraint.expression.c_str(), constraint.expression.size() + 1);
+        for (int particle : constraint.particles)
             fingerprint.add(particle);
-        for (const auto& parameter : parameters)
+        for (const auto& parameter : constraint.parameters)
             fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
     }
     return fingerprint.get();
 }
 
-void VRattleRunState::write(std::ostream& stream) const {
+void RunState::write(std::ostream& stream) const {
     writeValue(stream, system);
     writeValue(stream, context);
     writeValue(stream, lastStepSize);
@@ -109,7 +104,6 @@ void VRattleRunState::write(std::ostream& stream) const {
     writeValue(stream, startsAfresh);
     if (startsAfresh)
         return;
-    writeValue(stream, forceGroups);
     writeValue(stream, (long long) methodValues.size());
     for (const auto& entry : methodValues) {
         writeArray(stream, vector<char>(entry.first.begin(), entry.first.end()));
@@ -126,7 +120,7 @@ void VRattleRunState::write(std::ostream& stream) const {
     writeArray(stream, contextVelocities);
 }
 
-void VRattleRunState::read(std::istream& stream) {
+void RunState::read(std::istream& stream) {
     readValue(stream, system);
     readValue(stream, context);
     readValue(stream, lastStepSize);
@@ -135,7 +129,6 @@ void VRattleRunState::read(std::istream& stream) {
     readValue(stream, startsAfresh);
     if (startsAfresh)
         return;
-    readValue(stream, forceGroups);
     long long numEntries;
     readValue(stream, numEntries);
     for (long long i = 0; i < numEntries; i++) {
@@ -154,14 +147,13 @@ void VRattleRunState::read(std::istream& stream) {
     readArray(stream, contextVelocities);
 }
 
-void VRattleRunState::write(SerializationNode& node) const {
+void RunState::write(SerializationNode& node) const {
     node.setLongProperty("system", (long long) system).setLongProperty("context", (long long) context);
     node.setDoubleProperty("lastStepSize", lastStepSize).setDoubleProperty("lastDensity", lastDensity);
     writeArray(node, "References", references);
     node.setBoolProperty("startsAfresh", startsAfresh);
     if (startsAfresh)
         return;
-    node.setIntProperty("forceGroups", forceGroups);
     SerializationNode& method = node.createChildNode("Method");
     for (const auto& entry : methodValues)
         writeArray(method, entry.first, entry.second);
@@ -176,7 +168,7 @@ void VRattleRunState::write(SerializationNode& node) const {
     writeArray(node, "ContextVelocities", contextVelocities);
 }
 
-void VRattleRunState::read(const SerializationNode& node) {
+void RunState::read(const SerializationNode& node) {
     system = (unsigned long long) node.getLongProperty("system");
     context = (unsigned long long) node.getLongProperty("context");
     lastStepSize = node.getDoubleProperty("lastStepSize");
@@ -185,7 +177,6 @@ void VRattleRunState::read(const SerializationNode& node) {
     startsAfresh = node.getBoolProperty("startsAfresh");
     if (startsAfresh)
         return;
-    forceGroups = node.getIntProperty("forceGroups");
     for (const SerializationNode& entry : node.getChildNode("Method").getChildren())
         readArray(node.getChildNode("Method"), entry.getName(), methodValues[entry.getName()]);
     readArray(node, "HalfStepVelocities", halfStepVelocities);
@@ -204,14 +195,14 @@ void VRattleRunState::read(const SerializationNode& node) {
     readArray(node, "ContextVelocities", contextVelocities);
 }
 
-const vector<double>& VRattleRunState::getMethodValues(const string& name, size_t count) const {
+const vector<double>& RunState::getMethodValues(const string& name, size_t count) const {
     auto entry = methodValues.find(name);
     if (entry == methodValues.end() || entry->second.size() != count)
         throwDamaged();
     return entry->second;
 }
 
-void VRattleRunState::requireSizes(int numParticles, int numMonitors) const {
+void RunState::requireSizes(int numParticles, int numMonitors) const {
     bool fits = (int) references.size() == numMonitors;
     if (!startsAfresh)
         fits = fits && (int) halfStepVelocities.size() == numParticles && (int) forces.size() == numParticles;

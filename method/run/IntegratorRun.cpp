@@ -1,0 +1,403 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "run/IntegratorRun.h"
+#include "constraints/StepFailure.h"
+#include "openmm/OpenMMException.h"
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using OpenMM::OpenMMException;
+using std::vector;
+
+namespace {
+
+// Trial steps of automatic step control: how often they are made shorter, and the ratio of densities from which on they are.
+const int MAX_HALVINGS = 8;
+const double START_ACCURACY = 1.1;
+
+const double NO_LIMIT = std::numeric_limits<double>::infinity();
+
+[[noreturn]] void throwFailure(const std::string& what, double time, const std::string& reason,
+                               const std::string& wayOut) {
+    std::stringstream message;
+    message.precision(10);
+    message << "VariableStepRattleIntegrator: " << what << " at t = " << time << " ps failed because " << reason
+            << wayOut;
+    throw OpenMMException(message.str());
+}
+
+// A trial run while it lives.
+class Trial {
+public:
+    Trial(RunDevice& device, double stepSize, bool isBackwards) : device(device) {
+        device.beginTrial(stepSize, isBackwards);
+    }
+    ~Trial() {
+        device.endTrial();
+    }
+    Trial(const Trial&) = delete;
+    Trial& operator=(const Trial&) = delete;
+    vector<double> step() {
+        device.takeTrialStep();
+        return device.getMonitorValues();
+    }
+
+private:
+    RunDevice& device;
+};
+
+} // namespace
+
+IntegratorRun::IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles,
+                             unsigned long long system) :
+        device(device), settings(settings), applied(settings), numParticles(numParticles), system(system),
+        areSettingsChanged(true), task(Task::Start) {
+    if (canTakeSettings())
+        takeSettings();
+}
+
+// ------------------------------------------------------------------------------------------------------- what has changed
+
+void IntegratorRun::settingsChanged() {
+    areSettingsChanged = true;
+}
+
+void IntegratorRun::nominalStepChanged() {
+    settingsChanged();
+    toldSize = 0.0;
+}
+
+void IntegratorRun::stateChanged() {
+    // OpenMM announces what it has loaded as a change of the user's; whether it is one, the fingerprint will tell.
+    if (saved == nullptr)
+        task = Task::Start;
+}
+
+void IntegratorRun::requireStepSize() const {
+    if (settings.stepSize == 0)
+        throw OpenMMException(
+            "VariableStepRattleIntegrator: the step size is 0, with which a Context computes energies "
+            "and takes no steps; set one with setStepSize()");
+}
+
+bool IntegratorRun::areConstraintsOthers() const {
+    return areSettingsChanged && !settings.hasSameConstraints(applied);
+}
+
+bool IntegratorRun::canTakeSettings() const {
+    return settings.isConsistent() && !areConstraintsOthers();
+}
+
+void IntegratorRun::takeSettings() {
+    if (!areSettingsChanged)
+        return;
+    settings.requireConsistent();
+    if (areConstraintsOthers())
+        throw OpenMMException("VariableStepRattleIntegrator: constraints have been added or replaced since the Context "
+                              "was created; call reinitialize(preserveState=True) of the Context to use them");
+    try {
+        device.setSettings(settings);
+    }
+    catch (const StepFailure& failure) {
+        throw OpenMMException(std::string("VariableStepRattleIntegrator: ") + failure.what());
+    }
+    const bool isSameGroup =
+        settings.usesMonitorForceGroup() == applied.usesMonitorForceGroup() &&
+        (!settings.usesMonitorForceGroup() || settings.monitorForceGroup == applied.monitorForceGroup);
+    if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups() ||
+        !settings.hasSameParameters(applied))
+        task = Task::Start;
+    applied = settings;
+    areSettingsChanged = false;
+}
+
+// Go on from a saved run, unless the Context is in another state.
+void IntegratorRun::takeSaved() {
+    if (saved == nullptr)
+        return;
+    try {
+        const bool goesOn = saved->context == device.getFingerprint() && device.resume(*saved, applied);
+        task = goesOn ? Task::None : Task::Start;
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("going on from a saved run", device.getTime(), failure.what(), "");
+    }
+    saved.reset();
+}
+
+// Bring the method's state in line with the Context, which may have been changed in between.
+void IntegratorRun::prepare(bool areForcesInvalid) {
+    takeSaved();
+    takeSettings();
+    try {
+        const RunDevice::Change change = device.findChange();
+        if (areForcesInvalid || change == RunDevice::Change::State) // a barostat, say
+            task = std::max(task, Task::ChangeState);
+        else if (change == RunDevice::Change::Box) // a new box without a word of a Force is the user's
+            task = Task::Start;
+        else if (change == RunDevice::Change::Velocities)
+            task = std::max(task, Task::ChangeVelocities);
+        if (task == Task::Start)
+            device.start();
+        else if (task == Task::ChangeState)
+            device.changeState();
+        else if (task == Task::ChangeVelocities)
+            device.changeVelocities();
+        task = Task::None;
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("the start", device.getTime(), failure.what(), "");
+    }
+}
+
+// --------------------------------------------------------------------------------------------------------- the steps
+
+// A step, which the device may not have taken when this returns.
+void IntegratorRun::askForStep(double maxTime) {
+    takeSaved(); // as long as no Force has changed the Context
+    prepare(device.updateState());
+    startAutomatic();
+    device.step(maxTime);
+    toldSize.reset();
+    toldDensity.reset();
+}
+
+template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
+    requireStepSize();
+    const long long count = device.getStepCount();
+    const std::optional<double> size = toldSize, density = toldDensity;
+    try {
+        ask();
+        device.settle();
+    }
+    catch (const StepFailure& failure) {
+        if (device.getStepCount() == count) { // then what was told is still true
+            toldSize = size;
+            toldDensity = density;
+        }
+        throwFailure("the step", device.getTime(), failure.what(),
+                     "; the Context is in the state before this step: use a smaller step size, or another monitor");
+    }
+}
+
+void IntegratorRun::step(int count) {
+    if (count > 0)
+        takeSteps([&] {
+            for (int i = 0; i < count; i++)
+                askForStep(NO_LIMIT);
+        });
+}
+
+void IntegratorRun::stepTo(double time) {
+    if (time > device.getTime())
+        takeSteps([&] {
+            while (time > device.getTime())
+                askForStep(time);
+        });
+}
+
+void IntegratorRun::reverse() {
+    requireStepSize();
+    prepare(false);
+    startAutomatic();
+    try {
+        device.reverse();
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
+    }
+    toldDensity.reset();
+}
+
+// ----------------------------------------------------------------------------------------------------------- trial runs
+
+vector<double> IntegratorRun::calibrate(int steps) {
+    requireStepSize();
+    prepare(false);
+    if (settings.isAutomatic)
+        return findAutomaticReferences(steps);
+    vector<double> means(settings.monitors.size(), 0.0);
+    try {
+        Trial trial(device, settings.stepSize, false);
+        for (int i = 0; i < steps; i++) {
+            const vector<double> values = trial.step();
+            for (size_t k = 0; k < means.size(); k++)
+                means[k] += values[k] / steps;
+        }
+    }
+    catch (const StepFailure& failure) {
+        throwFailure("calibrate()", device.getTime(), failure.what(),
+                     "; the Context is unchanged: use a smaller step size");
+    }
+    for (size_t k = 0; k < means.size(); k++)
+        if (!(means[k] > 0))
+            throw OpenMMException("VariableStepRattleIntegrator: monitor " + std::to_string(k) +
+                                  " is zero all along the trial run of calibrate(); choose another monitor");
+    return means;
+}
+
+// Start automatic step control, if the run is not in the middle of a sequence of its steps.
+void IntegratorRun::startAutomatic() {
+    if (!settings.isAutomatic || device.hasStarted())
+        return;
+    const vector<double> given = device.getReferences();
+    if (std::any_of(given.begin(), given.end(), [](double reference) { return !(reference > 0); })) {
+        vector<double> references = findAutomaticReferences(settings.calibrationSteps);
+        for (size_t k = 0; k < references.size(); k++)
+            if (given[k] > 0) // set by the user
+                references[k] = given[k];
+        device.setReferences(references);
+    }
+    startFromTrialSteps();
+}
+
+// The geometric means of the two monitors over a trial run of fixed steps. Where steps of the nominal size fail, shorter ones
+// must do.
+vector<double> IntegratorRun::findAutomaticReferences(int steps) {
+    double stepSize = settings.stepSize;
+    for (int halvings = 0;; halvings++) {
+        vector<double> logarithms(AutomaticControl::NUM_MONITORS, 0.0);
+        double floor = 0; // the logarithm of what is zero but for rounding
+        try {
+            Trial trial(device, stepSize, false);
+            for (int i = 0; i < steps; i++) {
+                const vector<double> values = trial.step();
+                const double negligible = device.getNegligibleValue();
+                floor += std::log(negligible) / steps;
+                for (size_t k = 0; k < logarithms.size(); k++)
+                    logarithms[k] += std::log(std::max(values[k], negligible)) / steps;
+            }
+        }
+        catch (const StepFailure& failure) {
+            if (halvings == MAX_HALVINGS)
+                throwFailure("the trial run of automatic step control", device.getTime(), failure.what(),
+                             "; the Context is unchanged: use a smaller step size");
+            stepSize *= 0.5;
+            continue;
+        }
+        vector<double> references;
+        for (double logarithm : logarithms) {
+            references.push_back(std::exp(logarithm));
+            if (!(references.back() > 0) || !(logarithm > floor + std::log(10)))
+                throw OpenMMException("VariableStepRattleIntegrator: in the trial run of the automatic step control "
+                                      "there is no force and nothing turns, so there is nothing to measure steps by; "
+                                      "take more trial steps with useAutomaticStepControl(), until something happens, "
+                                      "or call clearMonitors() for fixed steps");
+        }
+        return references;
+    }
+}
+
+// Two trial steps backwards start the sequences of densities. Their size is that of the first step, which only they tell.
+void IntegratorRun::startFromTrialSteps() {
+    const vector<double> start = device.getMonitorValues();
+    double density = device.densityOf({start[0], 0.0});
+    for (int tries = 0;; tries++) {
+        vector<double> back, secondBack;
+        try {
+            Trial trial(device, settings.stepSize / density, true);
+            back = trial.step();
+            const double found = device.densityOf({start[0], back[1]});
+            if (found > START_ACCURACY * density && tries < MAX_HALVINGS) {
+                density = found;
+                continue;
+            }
+            secondBack = trial.step();
+        }
+        catch (const StepFailure& failure) {
+            if (tries >= MAX_HALVINGS)
+                throwFailure("the start of automatic step control", device.getTime(), failure.what(),
+                             "; the Context is unchanged: use a smaller step size");
+            density *= 2;
+            continue;
+        }
+        device.startDensities(back, secondBack);
+        return;
+    }
+}
+
+// --------------------------------------------------------------------------------------------------- numbers of the run
+
+double IntegratorRun::getStepSize() {
+    const double size = toldSize ? *toldSize : device.getLastStep().size;
+    return size > 0 ? size : settings.stepSize;
+}
+
+double IntegratorRun::getStepDensity() {
+    return toldDensity ? *toldDensity : device.getLastStep().density;
+}
+
+double IntegratorRun::getReference(int index) {
+    if (canTakeSettings() && areSettingsChanged) {
+        takeSaved();
+        takeSettings();
+    }
+    return getReferences()[index];
+}
+
+// Of the settings that there are, though the device may have those before.
+vector<double> IntegratorRun::getReferences() {
+    const bool haveSameUnits = std::equal(
+        settings.monitors.begin(), settings.monitors.end(), applied.monitors.begin(), applied.monitors.end(),
+        [](const StepMonitor::Term& a, const StepMonitor::Term& b) { return a.kind == b.kind && a.order == b.order; });
+    if (haveSameUnits && settings.isAutomatic == applied.isAutomatic)
+        return device.getReferences();
+    return vector<double>(settings.getNumReferences(), 0.0);
+}
+
+double IntegratorRun::getMonitorValue(int index) {
+    prepare(false);
+    return device.getMonitorValues()[index];
+}
+
+vector<double> IntegratorRun::getMultipliers() {
+    prepare(false);
+    return device.getMultipliers();
+}
+
+// ------------------------------------------------------------------------------------------------ saving and resuming
+
+RunState IntegratorRun::save() {
+    RunState run;
+    run.system = system;
+    // Settings that no step can be taken with: whatever becomes of them, the run will start afresh.
+    if (canTakeSettings()) {
+        takeSaved();
+        takeSettings();
+        run.startsAfresh = task != Task::None;
+    }
+    run.context = device.getFingerprint();
+    run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
+    run.lastDensity = getStepDensity();
+    run.references = getReferences();
+    if (!run.startsAfresh)
+        device.save(run);
+    return run;
+}
+
+void IntegratorRun::requireUsable(const RunState& run, const IntegratorSettings& other) const {
+    if (run.system != system)
+        return;
+    run.requireSizes(numParticles, other.getNumReferences());
+    if (!run.startsAfresh)
+        device.canResume(run, other);
+}
+
+void IntegratorRun::resume(const RunState& run) {
+    saved.reset();
+    task = Task::Start;
+    settingsChanged();
+    toldSize = run.lastStepSize;
+    toldDensity = run.lastDensity;
+    if (!canTakeSettings())
+        return;
+    takeSettings();
+    if ((int) run.references.size() == settings.getNumReferences())
+        device.setReferences(run.references);
+    if (run.system == system && !run.startsAfresh && device.canResume(run, settings))
+        saved = std::make_unique<RunState>(run);
+}

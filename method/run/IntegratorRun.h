@@ -1,0 +1,100 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_INTEGRATORRUN_H_
+#define OPENMMVRATTLE_INTEGRATORRUN_H_
+
+#include "run/IntegratorSettings.h"
+#include "run/RunDevice.h"
+#include "run/RunState.h"
+#include <memory>
+#include <optional>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * A run in a Context: takes note of changes, starts, steps, tries steps out, saves, goes on from what was saved, and says what failed.
+ * It is the same for all platforms and does nothing itself; a RunDevice does.
+ */
+class IntegratorRun {
+public:
+    /**
+     * @param device          does the work; must live as long as the run
+     * @param settings        of the integrator, whose changes settingsChanged() announces; must live as long as the run
+     * @param numParticles    of the System
+     * @param system          RunState::fingerprintOf() the System
+     */
+    IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles, unsigned long long system);
+
+    /** Take note that the settings have changed; they are in force with the next step. */
+    void settingsChanged();
+    /** Take note that the nominal step has been set: it is what getStepSize() returns until a step is taken. */
+    void nominalStepChanged();
+    /** Take note that the user has changed the Context: unless it is in the state of a saved run, the next step starts afresh. */
+    void stateChanged();
+
+    void step(int count);
+    void stepTo(double time);
+    void reverse();
+    /** The mean of each monitor over a trial run from the current state, which stays as it is. */
+    std::vector<double> calibrate(int steps);
+
+    /** Of the most recent step, or the nominal one. */
+    double getStepSize();
+    double getStepDensity();
+    /** The reference value in force, 0 if there is none yet. */
+    double getReference(int index);
+    double getMonitorValue(int index);
+    std::vector<double> getMultipliers();
+    RunDevice& getDevice() {
+        return device;
+    }
+    unsigned long long getSystemFingerprint() const {
+        return system;
+    }
+
+    RunState save();
+    /**
+     * Throw an OpenMMException if the parts of a saved run do not fit together, or its settings cannot be used here.
+     *
+     * @param saved    the settings that were saved with it
+     */
+    void requireUsable(const RunState& run, const IntegratorSettings& saved) const;
+    /**
+     * Go on from a saved run whose settings are those of the integrator by now. Where the Context is not in its state at the next step,
+     * or the masses and constraints are others, or the forces turn out to be others, the run starts afresh with the saved
+     * reference values.
+     */
+    void resume(const RunState& run);
+
+private:
+    /** What is to be done before the next step, from the least to the greatest. */
+    enum class Task { None, ChangeVelocities, ChangeState, Start };
+    void requireStepSize() const;
+    bool areConstraintsOthers() const;
+    bool canTakeSettings() const;
+    void takeSettings();
+    void takeSaved();
+    void prepare(bool areForcesInvalid);
+    std::vector<double> getReferences();
+    void askForStep(double maxTime);
+    template <class Ask> void takeSteps(Ask ask);
+    void startAutomatic();
+    std::vector<double> findAutomaticReferences(int steps);
+    void startFromTrialSteps();
+    RunDevice& device;
+    const IntegratorSettings& settings;
+    IntegratorSettings applied; // those that the device has
+    const int numParticles;
+    const unsigned long long system;
+    bool areSettingsChanged;
+    Task task;
+    std::unique_ptr<RunState> saved; // to go on from, until it is known whether the Context is in its state
+    // What is to be said of the last step, where the device does not know it.
+    std::optional<double> toldSize, toldDensity;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_INTEGRATORRUN_H_

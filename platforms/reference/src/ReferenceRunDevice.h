@@ -1,0 +1,95 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_REFERENCERUNDEVICE_H_
+#define OPENMMVRATTLE_REFERENCERUNDEVICE_H_
+
+#include "openmm/Integrator.h"
+#include "openmm/internal/ContextImpl.h"
+#include "openmm/reference/ReferencePlatform.h"
+#include "run/RunDevice.h"
+#include "step/VRattleDynamics.h"
+#include <memory>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The device for the Reference platform and those derived from it: it moves data between the vectors of a Context and
+ * VRattleDynamics, and asks for the forces.
+ */
+class ReferenceRunDevice : public RunDevice {
+public:
+    ReferenceRunDevice(OpenMM::ContextImpl& context, OpenMM::ReferencePlatform::PlatformData& data,
+                       const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    void setSettings(const IntegratorSettings& settings) override;
+    std::vector<double> getReferences() override;
+    void setReferences(const std::vector<double>& references) override;
+    bool updateState() override;
+    Change findChange() override;
+    unsigned long long getFingerprint() override;
+    void start() override;
+    void changeState() override;
+    void changeVelocities() override;
+    bool hasStarted() override;
+    void step(double maxTime) override;
+    void settle() override;
+    void reverse() override;
+    LastStep getLastStep() override;
+    double getTime() override;
+    long long getStepCount() override;
+    void beginTrial(double stepSize, bool isBackwards) override;
+    void takeTrialStep() override;
+    void endTrial() override;
+    std::vector<double> getMonitorValues() override;
+    std::vector<double> getMultipliers() override;
+    double computeKineticEnergy() override;
+    long long getNumForceEvaluations() override;
+    long long getNumSolverIterations() override;
+    long long getNumRescues() override;
+    double getNegligibleValue() override;
+    double densityOf(const std::vector<double>& values) override;
+    void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) override;
+    void save(RunState& run) override;
+    bool canResume(const RunState& run, const IntegratorSettings& saved) override;
+    bool resume(const RunState& run, const IntegratorSettings& saved) override;
+
+private:
+    typedef std::vector<OpenMM::Vec3> Vectors;
+    /** The Context, where it is not in the method's state: as the user or a Force has left it, until a step is complete. */
+    struct Ahead {
+        Vectors positions, velocities;
+    };
+    VRattleDynamics::Memory memoryOf(const RunState& run, const IntegratorSettings& saved) const;
+    double computeForces();
+    double computeForcesAt(const Vectors& positions, Vectors& forces);
+    double advance(double maxTime, double direction);
+    void putBack();
+    const Vectors& knownPositions() const;
+    const Vectors& knownVelocities() const;
+    bool differ(const Vectors& a, const Vectors& b) const;
+    void writeMoving(const Vectors& from, Vectors& to) const;
+    OpenMM::ContextImpl& context;
+    OpenMM::ReferencePlatform::PlatformData& data;
+    const OpenMM::Integrator& integrator;
+    std::vector<double> masses;
+    std::vector<ExpressionConstraint> expressions;
+    std::unique_ptr<VRattleDynamics> dynamics;
+    VRattleDynamics::Settings settings;
+    int forceGroups, monitorForceGroup;
+    bool hasMassless, mayForcesChangePositions, mayForcesChangeVelocities;
+    std::unique_ptr<Ahead> ahead;
+    OpenMM::Vec3 boxVectors[3]; // when they were last looked at
+    LastStep lastStep;
+    long long numForceEvaluations;
+    /** A trial run, and what is to be put back after it. */
+    struct Trial {
+        VRattleDynamics::Kept kept;
+        double time, direction;
+    };
+    std::unique_ptr<Trial> trial;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_REFERENCERUNDEVICE_H_
