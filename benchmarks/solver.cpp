@@ -7,8 +7,8 @@
 //
 //     solver PROBLEM STEP STEPS REPEATS Explicit|SemiExplicit THREADS
 
-#include "step/VRattleDynamics.h"
 #include "openmm/internal/ThreadPool.h"
+#include "step/VRattleDynamics.h"
 #include <algorithm>
 #include <chrono>
 #include <cmath>

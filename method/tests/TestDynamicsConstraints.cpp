@@ -233,7 +233,7 @@ void testClustersOfDifferentLengths() {
     ASSERT_EQUAL(3, (int) system.getBatches().size());
     ASSERT_EQUAL(m, system.getFirstGeneral());
     dynamics.setSettings(
-        {1e-3, 0, 0, 1e-10, StepDensity::SemiExplicit, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, 8, false});
+        {1e-3, 0, 0, 1e-10, StepDensity::SemiExplicit, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false});
     vector<Vec3> forces(e.masses.size());
     for (Vec3& force : forces)
         force = randomVector(random);

@@ -28,7 +28,7 @@ from openmmvrattle import VariableStepRattleIntegrator
 BAD_SIZES = [0.0, -0.001, float("nan"), float("inf"), -float("inf")]
 
 
-@pytest.mark.parametrize("size", BAD_SIZES)
+@pytest.mark.parametrize("size", BAD_SIZES[1:])
 def test_step_sizes_must_be_positive_and_finite(size: float) -> None:
     with pytest.raises(openmm.OpenMMException, match="step size"):
         VariableStepRattleIntegrator(size)
@@ -36,10 +36,9 @@ def test_step_sizes_must_be_positive_and_finite(size: float) -> None:
     for method in (integrator.setStepSize, integrator.setNominalStepSize):
         with pytest.raises(openmm.OpenMMException, match="step size"):
             method(size)
-    if size != 0:  # which means no bound
-        for method in (integrator.setMinimumStepSize, integrator.setMaximumStepSize):
-            with pytest.raises(openmm.OpenMMException, match="step size"):
-                method(size)
+    for method in (integrator.setMinimumStepSize, integrator.setMaximumStepSize):
+        with pytest.raises(openmm.OpenMMException, match="step size"):
+            method(size)
     assert value(integrator.getNominalStepSize()) == 0.001
     assert value(integrator.getMaximumStepSize()) == 0.002
     assert value(integrator.getMinimumStepSize()) == 0.00002
@@ -53,25 +52,70 @@ def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
     assert integrator.getConstraintTolerance() == 1e-8
 
 
-def test_bounds_must_enclose_the_nominal_size() -> None:
+def test_bounds_must_enclose_the_nominal_size_when_a_step_is_taken() -> None:
+    model = chain()
     integrator = VariableStepRattleIntegrator(0.001)
-    for size in (0.001, 0.0011, 1.0):
-        with pytest.raises(openmm.OpenMMException, match="minimum"):
-            integrator.setMinimumStepSize(size)
-    for size in (0.001, 0.0009, 1e-9):
-        with pytest.raises(openmm.OpenMMException, match="maximum"):
-            integrator.setMaximumStepSize(size)
-    integrator.setMinimumStepSize(0.0005)
-    integrator.setMaximumStepSize(0.004)
-    for size in (0.0005, 0.0004, 0.004, 0.005):
-        with pytest.raises(openmm.OpenMMException, match="minimum|maximum|between"):
-            integrator.setStepSize(size)
-    assert value(integrator.getStepSize()) == 0.001
-    integrator.setStepSize(0.0015)
+    context = open_context(model.system(), integrator, "Reference", model)
+    integrator.step(2)
+    time = time_of(context)
+    for minimum, maximum in ((0.001, 0.002), (0.0011, 0.002), (0, 0.001), (0, 0.0009), (0.003, 0.0002)):
+        integrator.setMinimumStepSize(minimum)
+        integrator.setMaximumStepSize(maximum)
+        for action in (lambda: integrator.step(1), lambda: integrator.stepTo(1.0), lambda: integrator.calibrate(2)):
+            with pytest.raises(openmm.OpenMMException) as error:
+                action()
+            for size in (minimum, 0.001, maximum):
+                assert f"({size:g} ps)" in str(error.value)
+        # Neither a State nor a reference value is refused for it.
+        context.getState(integratorParameters=True)
+        assert integrator.getReferenceMonitorValue() > 0
+    assert time_of(context) == time
+    # In the order from which a setter would have to refuse one of the three.
+    integrator.setMinimumStepSize(0.002)
+    integrator.setMaximumStepSize(0.008)
+    integrator.setStepSize(0.004)
+    integrator.step(1)
     integrator.setMinimumStepSize(0)
     integrator.setMaximumStepSize(0)
-    integrator.setStepSize(1.0)
     assert value(integrator.getMinimumStepSize()) == value(integrator.getMaximumStepSize()) == 0
+    integrator.step(1)
+
+
+def test_a_step_size_of_zero_is_for_energies() -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(0)
+    context = open_context(model.system(), integrator, "Reference", model)
+    assert value(context.getState(energy=True).getPotentialEnergy()) > 0
+    assert len(integrator.getMultipliers()) == context.getSystem().getNumConstraints()
+    integrator.step(0)
+    for action in (
+        lambda: integrator.step(1),
+        lambda: integrator.stepTo(1.0),
+        lambda: integrator.calibrate(2),
+        integrator.reverse,
+    ):
+        with pytest.raises(openmm.OpenMMException, match="step size is 0.*setStepSize"):
+            action()
+    integrator.setStepSize(0.001)
+    integrator.step(5)
+    assert time_of(context) > 0
+
+
+def test_the_step_size_that_was_set_is_returned_until_a_step_is_taken() -> None:
+    model = chain()
+    integrator = VariableStepRattleIntegrator(0.001)
+    context = open_context(model.system(), integrator, "Reference", model)
+    integrator.step(10)
+    taken = value(integrator.getStepSize())
+    assert taken != 0.001
+    integrator.setStepSize(0.0007)
+    assert value(integrator.getStepSize()) == 0.0007
+    integrator.getMultipliers()
+    assert value(integrator.getStepSize()) == 0.0007
+    integrator.step(1)
+    assert value(integrator.getStepSize()) == pytest.approx(0.7 * taken, rel=0.2)
+    assert value(integrator.getStepSize()) != 0.0007
+    assert context.getStepCount() == 11
 
 
 def test_monitor_settings() -> None:
