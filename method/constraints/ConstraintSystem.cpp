@@ -12,6 +12,10 @@ using std::vector;
 
 namespace {
 
+// A motion that changes the gradient of an expression by this fraction of its size is too long for an iteration, and that is a
+// matter of singular geometry if it is shorter than the second fraction of the distances between the particles.
+const double STRONG_CURVATURE = 0.25, SHARPNESS = 0.1;
+
 std::string listParticles(const vector<int>& particles) {
     const size_t maxListed = 12;
     std::string text = particles.size() == 1 ? "particle " : "the particles ";
@@ -135,6 +139,43 @@ int ConstraintSystem::findLargest(const vector<double>& g, const Jacobian& nearb
         if (!(std::fabs(errors[k]) <= std::fabs(errors[largest])))
             largest = k;
     return largest;
+}
+
+int ConstraintSystem::findSingular(const vector<Vec3>& q, const vector<Vec3>& displacement, const Jacobian& jacobian,
+                                   Jacobian& velocityJacobian) const {
+    evaluateVelocityJacobian(q, displacement, velocityJacobian);
+    int singular = NONE;
+    double largest = STRONG_CURVATURE;
+    for (const ExpressionRow& row : expressionRows) {
+        const vector<int>& particles = expressions[givenIndex[row.constraint] - numGivenDistances].particles;
+        const bool holdsFixed = row.end - row.first < (int) particles.size();
+        Vec3 centre, shift;
+        for (int i : particles) {
+            centre += q[i] / (double) particles.size();
+            if (particles.size() > 1 && !holdsFixed) // else its motion as a whole is no motion within it
+                shift += displacement[i] / (double) particles.size();
+        }
+        double radius = EXPRESSION_LENGTH * EXPRESSION_LENGTH, path = 0, gradient = 0,
+               change = 0; // all of them squared
+        for (int entry = row.first; entry < row.end; entry++) {
+            const int i = getParticleOf(entry);
+            const Vec3 r = q[i] - centre, d = displacement[i] - shift;
+            radius = std::max(radius, r.dot(r));
+            path = std::max(path, d.dot(d));
+            gradient += jacobian[entry].dot(jacobian[entry]);
+            change += velocityJacobian[entry].dot(velocityJacobian[entry]);
+        }
+        const double curvature = std::sqrt(change / gradient);
+        // Over a length of the size of its particles' distances the gradient of any expression turns.
+        const bool isSharp = !(path >= SHARPNESS * SHARPNESS * curvature * curvature * radius);
+        if (std::isnan(curvature))
+            return row.constraint;
+        if (isSharp && curvature > largest) {
+            largest = curvature;
+            singular = row.constraint;
+        }
+    }
+    return singular;
 }
 
 // The distance constraints' part of G(x).

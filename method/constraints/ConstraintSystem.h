@@ -217,6 +217,19 @@ public:
                     const Part& part = ALL) const;
     /** The index of the constraint with the largest relative error. */
     int findLargest(const std::vector<double>& g, const Jacobian& nearby) const;
+    /**
+     * The expression that is closest to a singular geometry, where its gradient is infinite or zero and no iteration finds a
+     * solution: a motion changes its gradient by at least a fraction of its size, though it is short beside the distances of the
+     * expression's particles.
+     *
+     * @param q                   positions
+     * @param displacement        the motion from there (nm)
+     * @param jacobian            G(q)
+     * @param velocityJacobian    work space
+     * @return the constraint, or NONE
+     */
+    int findSingular(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& displacement,
+                     const Jacobian& jacobian, Jacobian& velocityJacobian) const;
     /** G(q), the Jacobian. */
     void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, const Part& part = ALL) const;
     /**

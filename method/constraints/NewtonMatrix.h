@@ -29,16 +29,22 @@ public:
 
 private:
     typedef Eigen::SparseMatrix<double> SparseMatrix;
+    struct SparseFactor : Eigen::SparseLU<SparseMatrix> {
+        double findSmallestPivot() const;
+    };
     struct Block {
         int first, size;
         size_t firstCoupling, endCoupling;
         Eigen::MatrixXd dense;
         Eigen::PartialPivLU<Eigen::MatrixXd> denseFactor;
         SparseMatrix sparse;
-        std::unique_ptr<Eigen::SparseLU<SparseMatrix>> sparseFactor;
+        std::unique_ptr<SparseFactor> sparseFactor;
     };
+    void findScales(const ConstraintSystem::Jacobian& jacobian, std::vector<double>& scales) const;
+    bool factorize(Block& block, const ConstraintSystem::Jacobian& next, const ConstraintSystem::Jacobian& current);
     const ConstraintSystem& system;
     std::vector<Block> blocks;
+    std::vector<double> rowScales, columnScales;
 };
 
 } // namespace OpenMMVRattle

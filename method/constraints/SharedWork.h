@@ -11,15 +11,18 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <exception>
 #include <functional>
 #include <limits>
+#include <utility>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
  * Goes through all clusters and free particles of a system with some tasks, on several threads where that is faster. What a task does
- * with one cluster, piece or block never depends on the number of threads, so that results do not either, to the last bit.
+ * with one cluster, piece or block never depends on the number of threads, so that results do not either, to the last bit. A task
+ * may throw: when all threads have ended, the exception of the first of them goes on to the caller.
  */
 class SharedWork {
 public:
@@ -30,6 +33,7 @@ public:
     struct Result {
         double error = 0, pieceError = 0, pivot = std::numeric_limits<double>::infinity();
         int iterations = 0, failed = ConstraintMatrix::REGULAR;
+        std::exception_ptr exception; // that ended a thread's share
         void addError(double other) {
             error = larger(error, other);
         }
@@ -137,12 +141,20 @@ private:
             const int numThreads = (int) results.size();
             auto runShare = [&](int thread) {
                 Result own; // on the thread's own stack, away from those of others
-                share(thread, numThreads, own);
+                try {
+                    share(thread, numThreads, own);
+                }
+                catch (...) { // which must leave neither a thread of the pool nor this one before the others have ended
+                    own.exception = std::current_exception();
+                }
                 results[thread] = own;
             };
             parallel(std::ref(runShare)); // which a std::function holds without allocating memory
-            for (const Result& each : results)
+            for (Result& each : results) {
+                if (each.exception != nullptr)
+                    std::rethrow_exception(std::exchange(each.exception, nullptr));
                 result.merge(each);
+            }
         }
         else
             share(0, 1, result);

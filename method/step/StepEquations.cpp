@@ -30,6 +30,18 @@ const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // where strained, badly scaled constraints make that rounding larger, the second number counts.
 const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
 
+// Newton's iteration takes the largest part 1, 1/2, 1/4, ... of its update that brings the error down by this fraction of what it
+// would were the constraints linear; below the smallest it gives up.
+const double SUFFICIENT_DECREASE = 0.25, SMALLEST_PART = 1e-4;
+
+/** Move by a part of an update, as moveBy(part) does, which returns the error there; returns whether a part has been found. */
+template <class Move> bool takeDampedUpdate(double error, const Move& moveBy) {
+    for (double part = 1; part >= SMALLEST_PART; part *= 0.5)
+        if (moveBy(part) <= (1 - SUFFICIENT_DECREASE * part) * error)
+            return true;
+    return false;
+}
+
 double dot(const vector<double>& a, const vector<double>& b) {
     double sum = 0;
     for (size_t i = 0; i < a.size(); i++)
@@ -255,35 +267,63 @@ bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
     system.evaluateJacobian(positions, jacobian);
     if (system.evaluate(positions, residual, jacobian) <= settings.tolerance)
         return false;
-    // Newton's iteration for g(q + M^-1 G(q)^T x) = 0 with the chord matrix K(q), then with the full one.
+    if (!projectByChord(positions) && !projectByNewton(positions)) {
+        for (int i : movingParticles)
+            acceleration[i] = qNext[i] - positions[i];
+        system.evaluateJacobian(positions, jacobian);
+        throwNotConverged(positions, acceleration);
+    }
+    positions = qNext;
+    return true;
+}
+
+// Chord iterations for g(q + M^-1 G(q)^T x) = 0 with K(q), which is enough where q is nearly right.
+bool VRattleDynamics::projectByChord(const vector<Vec3>& positions) {
     matrix.factorize(jacobian);
     qNext = positions;
-    bool isNewton = false;
     double previous = std::numeric_limits<double>::infinity();
-    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
+    while (true) {
         lastError = system.evaluate(qNext, residual, jacobian);
-        if (!std::isfinite(lastError))
-            break;
-        const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
-        if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN)) {
-            positions = qNext;
+        const bool isSlow = !(lastError <= SLOW_CONVERGENCE * previous);
+        if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN))
             return true;
-        }
-        isNewton = isNewton || isSlow;
+        if (isSlow)
+            return false;
         previous = lastError;
-        correction = residual;
-        if (isNewton) {
-            system.evaluateJacobian(qNext, jacobianNext);
-            if (!newtonMatrix.factorize(jacobianNext, jacobian))
-                break;
-            newtonMatrix.solve(correction);
-        }
-        else
-            matrix.solve(correction);
-        system.addTransposedOverMass(jacobian, correction, -1.0, qNext);
+        matrix.solve(residual);
+        system.addTransposedOverMass(jacobian, residual, -1.0, qNext);
         numIterations++;
     }
-    throwNotConverged();
+}
+
+// Damped Newton's iteration, each step of it along M^-1 G^T of where it has come to.
+bool VRattleDynamics::projectByNewton(const vector<Vec3>& positions) {
+    qNext = positions;
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
+        system.evaluateJacobian(qNext, jacobian);
+        lastError = system.evaluate(qNext, residual, jacobian);
+        const bool isSlow = !(lastError <= SLOW_CONVERGENCE * previous);
+        if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN))
+            return true;
+        previous = lastError;
+        if (!std::isfinite(lastError) ||
+            matrix.tryToFactorize(jacobian, ConstraintSystem::ALL) != ConstraintMatrix::REGULAR)
+            return false;
+        correction = residual;
+        matrix.solve(correction);
+        const bool isFound = takeDampedUpdate(lastError, [&](double part) {
+            wNext = qNext;
+            system.addTransposedOverMass(jacobian, correction, -part, wNext);
+            return system.evaluate(wNext, residual, jacobian);
+        });
+        // Where the error is no more than the tolerance, rounding may keep it from becoming less.
+        if (!isFound && lastError > settings.tolerance)
+            return false;
+        qNext.swap(wNext);
+        numIterations++;
+    }
+    return false;
 }
 
 // ------------------------------------------------------------------------------------------ the equations of a step
@@ -452,22 +492,30 @@ bool VRattleDynamics::solvePositionsByNewton(const Trial& trial) {
 }
 
 bool VRattleDynamics::iterateNewton(const Trial& trial) {
-    double previous = std::numeric_limits<double>::infinity();
-    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
+    auto moveTo = [&](double part) {
+        for (size_t k = 0; k < lambdaNext.size(); k++)
+            lambdaNext[k] = response[k] + part * correction[k] / (trial.kick * trial.drift);
         computeTrial(trial);
-        lastError = system.evaluate(qNext, residual, jacobian);
-        if (!std::isfinite(lastError))
-            return false;
+        return system.evaluate(qNext, residual, jacobian);
+    };
+    computeTrial(trial);
+    lastError = system.evaluate(qNext, residual, jacobian);
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS && std::isfinite(lastError); iteration++) {
         const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
         if (iteration > 0 && lastError <= settings.tolerance * (isSlow ? 1.0 : REGULAR_MARGIN))
             return true;
         previous = lastError;
         correction = residual;
+        response = lambdaNext; // where the update starts
         system.evaluateJacobian(qNext, jacobianNext);
         if (!newtonMatrix.factorize(jacobianNext, jacobian))
             return false;
         newtonMatrix.solve(correction);
-        updateMultipliers(trial, 0, system.getNumConstraints());
+        if (lastError <= settings.tolerance)
+            lastError = moveTo(1); // rounding may keep the error from becoming less
+        else if (!takeDampedUpdate(lastError, [&](double part) { return lastError = moveTo(part); }))
+            return false;
         numIterations++;
     }
     return false;
@@ -642,10 +690,11 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
 // Solve for rho+, lambda, w+ and q+ of a regular step; returns its size.
 double VRattleDynamics::solveRegular() {
     const double h = settings.stepSize;
-    auto solveWith = [&](double next) {
+    auto trialWith = [&](double next) -> Trial {
         rhoNext = next;
-        return solvePositions({w, 0.5 * (h / rho + h / rhoNext), h / rhoNext}, false);
+        return {w, 0.5 * (h / rho + h / rhoNext), h / rhoNext};
     };
+    auto solveWith = [&](double next) { return solvePositions(trialWith(next), false); };
     const bool isFixed = settings.isFixedStep || monitor.isEmpty();
     bool isSolved;
     if (isFixed)
@@ -660,22 +709,35 @@ double VRattleDynamics::solveRegular() {
     }
     if (isFixed || settings.update == StepDensity::Bounded) {
         if (!isSolved)
-            throwNotConverged();
+            throwNotConverged(trialWith(rhoNext));
     }
     else if (!isSolved || density.isFarBelowBound(rhoNext)) {
         // A rescue: the sum gave no step, or one far above the maximum.
         if (!solveWith(density.boundedUpdate(u, rho)))
-            throwNotConverged();
+            throwNotConverged(trialWith(rhoNext));
         numRescues++;
         isRescued = true;
     }
     return h / rhoNext;
 }
 
-void VRattleDynamics::throwNotConverged() const {
+void VRattleDynamics::throwNotConverged(const Trial& trial) {
+    for (int i : movingParticles)
+        acceleration[i] = trial.start[i] * trial.drift;
+    throwNotConverged(q, acceleration);
+}
+
+void VRattleDynamics::throwNotConverged(const vector<Vec3>& from, const vector<Vec3>& displacement) {
     std::stringstream reason;
+    // What keeps an iteration from converging need not be what has the largest error in the end.
     const int worst = system.findLargest(residual, jacobian);
-    if (std::isfinite(lastError))
+    const int singular = system.findSingular(from, displacement, jacobian, velocityJacobian);
+    if (singular != ConstraintSystem::NONE)
+        reason << system.describe(singular)
+               << " is close to a singular geometry, in which its gradient is infinite or zero (as that of a dihedral "
+                  "angle "
+                  "over three particles in a line); keep the molecule away from there, or constrain something else";
+    else if (std::isfinite(lastError))
         reason << system.describe(worst) << " could not be solved for (relative error " << lastError << " left)";
     else if (system.isExpression(worst) && !std::isfinite(residual[worst]))
         reason << system.describe(worst) << " became " << residual[worst];

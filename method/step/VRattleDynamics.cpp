@@ -364,8 +364,9 @@ double VRattleDynamics::step(double maxStep) {
         // A step of plain RATTLE from the on-step state.
         if (isShortened)
             stepKind = Shortened;
-        if (!solvePositions({v, 0.5 * stepNext, stepNext}, true))
-            throwNotConverged();
+        const Trial trial = {v, 0.5 * stepNext, stepNext};
+        if (!solvePositions(trial, true))
+            throwNotConverged(trial);
     }
     if (isShortened && hasDensity) // where the density would be at the end of the shortened step
         rhoNext = rho + (rhoNext - rho) * std::min(1.0, stepNext / full);

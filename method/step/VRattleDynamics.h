@@ -255,6 +255,8 @@ private:
     void beginRates(const OnStep& state, const ConstraintSystem::Part& part);
     void formRateEquations(const OnStep& state, const ConstraintSystem::Part& part);
     double evaluateRate();
+    bool projectByChord(const std::vector<OpenMM::Vec3>& positions);
+    bool projectByNewton(const std::vector<OpenMM::Vec3>& positions);
 
     /** A step from q: half-step velocities start + kick acceleration, positions q + drift of these. */
     struct Trial {
@@ -285,7 +287,9 @@ private:
     SolveResult solveCoupledByNewton();
     double solveRegular();
     void keepOffsets();
-    [[noreturn]] void throwNotConverged() const;
+    [[noreturn]] void throwNotConverged(const Trial& trial);
+    [[noreturn]] void throwNotConverged(const std::vector<OpenMM::Vec3>& from,
+                                        const std::vector<OpenMM::Vec3>& displacement);
 
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
     std::vector<double> evaluateHalfSteps();

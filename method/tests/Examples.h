@@ -55,21 +55,17 @@ struct Example {
 };
 
 /**
- * A backbone that an expression holds to a fixed particle at one end, a side group at each third particle and a triangle at
- * each seventh, beside some waters and free particles. The constraints stand in no order.
+ * A backbone with a side group at each third particle and a triangle at each seventh, beside some waters and free particles. The
+ * constraints stand in no order.
  */
 inline Example makeComb(int backbone) {
     using OpenMM::Vec3;
     Example e;
-    int last = e.add(0, Vec3());
+    int last = e.add(20, Vec3());
     for (int i = 1; i < backbone; i++) {
         const Vec3 place = Vec3(0.12 * i, 0.05 * (i % 2), 0) + e.randomVector(0.03);
         const int next = e.add(e.uniform(10, 40), place);
-        if (i == 1)
-            e.expressions.push_back(
-                {"(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-square", {last, next}, {{"square", place.dot(place)}}});
-        else
-            e.join(last, next);
+        e.join(last, next);
         if (i % 3 == 0)
             e.join(next, e.add(1, place + Vec3(0, 0.1, 0.03)));
         if (i % 7 == 0) {
@@ -88,7 +84,10 @@ inline Example makeComb(int backbone) {
     return e;
 }
 
-/** Rigid sections of three particles, whose centres are held together by three expressions of both. */
+/**
+ * Rigid sections of three particles, whose centres are held together by three expressions of both; the first is held to a fixed
+ * particle.
+ */
 inline Example makeRod(int sections) {
     using OpenMM::Vec3;
     using std::string;
@@ -110,6 +109,9 @@ inline Example makeRod(int sections) {
             e.expressions.push_back({expression, particles, {}});
         e.expressions[e.expressions.size() - 3].parameters["length"] = 0.1;
     }
+    const int fixed = e.add(0, Vec3(0, 0, 0.1));
+    const Vec3 r = e.positions[0] - e.positions[fixed];
+    e.expressions.push_back({"(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-square", {0, fixed}, {{"square", r.dot(r)}}});
     return e;
 }
 

@@ -9,9 +9,11 @@
 #include "constraints/ClusterCut.h"
 #include <Eigen/SparseCholesky>
 #include <Eigen/SparseCore>
+#include <atomic>
 #include <cmath>
 #include <random>
 #include <set>
+#include <thread>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -261,6 +263,38 @@ void testThreads(const Example& e) {
     }
 }
 
+// What a task throws on some thread ends as an exception of the caller, and the work can go on.
+void testExceptions(const Example& e) {
+    const ConstraintSystem system(e.masses, e.distances, e.expressions);
+    const int numThreads = 3;
+    SharedWork work(system);
+    work.setParallel(
+        [&](const std::function<void(int)>& task) {
+            vector<std::thread> threads;
+            for (int thread = 1; thread < numThreads; thread++)
+                threads.emplace_back([&task, thread] { task(thread); });
+            task(0);
+            for (std::thread& thread : threads)
+                thread.join();
+        },
+        numThreads);
+    const int last = (int) system.getPieces().size() - 1;
+    for (const vector<int>& failing : {vector<int>{0}, vector<int>{last}, vector<int>{0, last / 2, last}}) {
+        std::atomic<int> count(0);
+        auto visit = [&](const ConstraintSystem::Part& piece, SharedWork::Result&) {
+            count++;
+            if (std::find(failing.begin(), failing.end(), piece.piece) != failing.end())
+                throw StepFailure("piece " + std::to_string(piece.piece));
+        };
+        const int before = count;
+        assertThrows("piece " + std::to_string(failing[0]), [&] { work.runOnPieces(visit); });
+        ASSERT(count - before >= (int) failing.size());
+    }
+    std::atomic<int> count(0);
+    work.runOnPieces([&](const ConstraintSystem::Part&, SharedWork::Result&) { count++; });
+    ASSERT_EQUAL(last + 1, (int) count);
+}
+
 // A doubled bond is found within a piece and among the joints.
 void testDependentConstraints(const Example& e) {
     const ConstraintSystem whole(e.masses, e.distances, e.expressions);
@@ -291,6 +325,7 @@ int main() {
         {"steps of a rod, Explicit", [&] { testSteps(rod, StepDensity::Explicit); }},
         {"any number of threads, a comb", [&] { testThreads(comb); }},
         {"any number of threads, a rod", [&] { testThreads(rod); }},
+        {"exceptions on threads", [&] { testExceptions(comb); }},
         {"dependent constraints", [&] { testDependentConstraints(comb); }},
     });
 }
