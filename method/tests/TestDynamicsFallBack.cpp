@@ -20,7 +20,7 @@ namespace {
 const string DISTANCE = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)";
 
 VRattleDynamics::Settings fixedSteps(double stepSize) {
-    return {stepSize, 0, 0, 1e-8, StepDensity::Explicit, {}, 8, false};
+    return {stepSize, 0, 0, 1e-8, StepDensity::Explicit, {}, false};
 }
 
 // A zigzag of bonds given as expressions; its particles stand where noise has moved them.
