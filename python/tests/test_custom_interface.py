@@ -32,7 +32,7 @@ from dense_reference import (
 from openmm import app, unit
 from openmmvrattle import CustomVariableStepRattleIntegrator as Custom
 from openmmvrattle import VariableStepRattleIntegrator
-from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters
+from openmmvrattle.testsystems import alanine_dipeptide, argon_cluster, rigid_waters
 from run_support import solvated
 
 SETTINGS: list[dict[str, Any]] = [
@@ -49,7 +49,7 @@ SETTINGS: list[dict[str, Any]] = [
 
 def settings_of(integrator: Any) -> dict[str, Any]:
     names = ["NominalStepSize", "StepSize", "MinimumStepSize", "MaximumStepSize", "UpdateMethod", "NormOrder"]
-    names += ["ConstraintTolerance", "MonitorForceGroup", "NumMonitors", "IntegrationForceGroups", "StepDensity"]
+    names += ["ConstraintTolerance", "MonitorForceGroup", "NumMonitors", "StepDensity"]
     names += ["NumForceEvaluations", "NumSolverIterations", "NumRescues"]
     result = {name: getattr(integrator, "get" + name)() for name in names}
     monitors = range(integrator.getNumMonitors())
@@ -79,7 +79,6 @@ def test_settings_are_those_of_the_plugin(chosen: dict[str, Any]) -> None:
     for each in (ours, plugin):
         each.setNominalStepSize(0.9 * unit.femtosecond)
         each.setNormOrder(3)
-        each.setIntegrationForceGroups({0, 2, 31})
     assert settings_of(ours) == settings_of(plugin)
     kinds = [name for name in dir(VariableStepRattleIntegrator) if name[0].isupper()]
     assert len(kinds) >= 14
@@ -90,12 +89,10 @@ def test_settings_are_those_of_the_plugin(chosen: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "act, exception, words",
     [
-        (lambda: Custom(0), openmm.OpenMMException, "nominal step size must be positive"),
+        (lambda: Custom(-0.001), openmm.OpenMMException, "nominal step size must be positive"),
         (lambda: Custom(float("nan")), openmm.OpenMMException, "nominal step size must be positive"),
         (lambda: Custom("0.001"), TypeError, "stepSize must be a number or a Quantity"),
         (lambda: Custom(1 * unit.nanometer), TypeError, "not a Quantity in nanometer"),
-        (lambda: Custom(0.001, minimumStepSize=0.002), openmm.OpenMMException, "must be smaller than the nominal"),
-        (lambda: Custom(0.001, maximumStepSize=0.001), openmm.OpenMMException, "must be larger than the nominal"),
         (lambda: Custom(0.001, maximumStepSize=-1), openmm.OpenMMException, "maximum step size must be positive"),
         (lambda: Custom(0.001, constraintTolerance=0), openmm.OpenMMException, "tolerance must be positive"),
         (lambda: Custom(0.001, normOrder=0.5), openmm.OpenMMException, "order of a norm must be at least 1"),
@@ -213,6 +210,7 @@ def test_copies_have_every_setting(way: str, chosen: dict[str, Any]) -> None:
     assert duplicate.getStepDensity() == 1
     if duplicate.getNumMonitors():
         assert duplicate.getReferenceMonitorValue() == chosen.get("referenceMonitorValue", 0)
+    assert duplicate.getIntegrationForceGroups() == integrator.getIntegrationForceGroups() == 0b10001
     other = open_context(model.system(), duplicate, "Reference", model)
     duplicate.step(10)
     assert np.array_equal(positions_of(other), positions_of(context))
@@ -233,12 +231,12 @@ def test_a_copy_keeps_subclass_and_attributes() -> None:
 
 def test_a_newer_program_is_refused() -> None:
     xml = openmm.XmlSerializer.serialize(Custom(0.001))
-    newer = xml.replace('name="vrattle_version" value="1"', 'name="vrattle_version" value="7"').replace(
-        'value="1" name="vrattle_version"', 'value="7" name="vrattle_version"'
+    newer = xml.replace('name="vrattle_version" value="2"', 'name="vrattle_version" value="7"').replace(
+        'value="2" name="vrattle_version"', 'value="7" name="vrattle_version"'
     )
-    newer = newer.replace('initialValue="1" name="vrattle_version"', 'initialValue="7" name="vrattle_version"')
+    newer = newer.replace('initialValue="2" name="vrattle_version"', 'initialValue="7" name="vrattle_version"')
     assert newer != xml
-    with pytest.raises(openmm.OpenMMException, match="version 7 of its program and this package reads version 1"):
+    with pytest.raises(openmm.OpenMMException, match="version 7 of its program and this package reads version 2"):
         Custom.cast(openmm.XmlSerializer.deserialize(newer))
 
 
@@ -499,7 +497,8 @@ def test_the_group_of_the_monitor_is_left_out_of_the_dynamics() -> None:
         context = open_context(system, integrator, "Reference", model)
         integrator.step(100)
         if cls is Custom:
-            assert integrator.getIntegrationForceGroups() == -1
+            uses_group = Custom.ForceGroupEnergy in monitors
+            assert integrator.getIntegrationForceGroups() == (-1 - (1 << 5) if uses_group else -1)
         return positions_of(context), (integrator.getMonitorValue(), integrator.getNumForceEvaluations())
 
     ours, numbers = run(Custom, 1.0, [Custom.ForceGroupEnergy])
@@ -529,19 +528,101 @@ def test_calibration() -> None:
         integrator.calibrate(0)
 
 
-def test_a_monitor_that_vanishes_at_the_start() -> None:
-    """A molecule in free flight that does not turn: no force anywhere."""
+def test_a_start_that_is_calm() -> None:
+    """A molecule in free flight that does not turn: no force anywhere, so the steps are nominal until there is one."""
+    model = waters(1)
+    system = model.system()
+    wall = openmm.CustomExternalForce("1e4*step(x - 0.25)*(x - 0.25)^2")
+    for i in range(3):
+        wall.addParticle(i)
+    system.addForce(wall)
+    integrator = Custom(0.001, constraintTolerance=1e-10)
+    context = open_context(system, integrator, "Reference", model)
+    context.setPositions(model.positions - np.max(model.positions, axis=0))
+    context.setVelocities(np.tile([5.0, 0.0, 0.0], (3, 1)))
+    start, sizes, references = energy_of(context), [], []
+    for _ in range(100):
+        integrator.step(1)
+        sizes.append(value(integrator.getStepSize()))
+        references.append(integrator.getReferenceMonitorValue())
+    calm = references.count(0.0)
+    assert 40 < calm < 55  # a quarter of a nanometre at 5 nm/ps
+    np.testing.assert_allclose(sizes[: calm + 1], 0.001, rtol=1e-12)
+    assert len(set(references[calm:])) == 1  # the first value above rounding stays
+    assert max(sizes) / min(sizes) > 1.1
+    assert abs(energy_of(context) - start) < 0.02 * start
+    assert integrator.getNumRescues() == 0
+
+
+def test_a_calm_calibration_leaves_the_reference_value_for_later() -> None:
     model = waters(1)
     integrator = Custom(0.001)
     context = open_context(model.system(), integrator, "Reference", model)
     context.setVelocities(np.tile([1.0, 0.0, 0.0], (3, 1)))
-    with pytest.raises(openmm.OpenMMException, match="monitor vanishes at the start.*set a reference value"):
-        integrator.step(5)
+    integrator.calibrate(5)
+    assert integrator.getReferenceMonitorValue() < 1e-3  # what rounding leaves
     assert time_of(context) == 0
-    np.testing.assert_allclose(positions_of(context), model.positions, rtol=0, atol=1e-15)
-    integrator.setReferenceMonitorValue(100.0)
-    integrator.step(5)
-    assert value(integrator.getStepSize()) == pytest.approx(0.002, rel=1e-3)
+
+
+def test_without_constraints_the_default_monitor_is_that_of_the_applied_force(platform: str) -> None:
+    test = argon_cluster(8)
+    runs = []
+    for settings in ({}, {"monitors": [Custom.ConstraintAndAppliedForce]}):
+        integrator = Custom(0.004, **settings)
+        context = open_context(test.system, integrator, platform, test)
+        integrator.step(50)
+        assert list(integrator.getMonitor(0)) == [Custom.ConstraintAndAppliedForce, 1.0, 1.0]
+        runs.append([integrator.getStepDensity(), integrator.getMonitorValue(), *positions_of(context).ravel()])
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert runs[0][0] != 1
+    integrator = Custom(0.004)
+    assert integrator.getMonitor(0)[0] == Custom.ConstraintForce
+    integrator.clearMonitors()
+    integrator.addMonitor(Custom.ConstraintForce)
+    context = open_context(test.system, integrator, platform, test)
+    with pytest.raises(openmm.OpenMMException, match="ConstraintForce needs constraints, and the System has none"):
+        integrator.step(1)
+
+
+def test_step_size_zero_is_for_energies() -> None:
+    model = chain()
+    integrator = Custom(0)
+    context = open_context(model.system(), integrator, "Reference", model)
+    assert np.isfinite(energy_of(context))
+    with pytest.raises(openmm.OpenMMException, match="no step can be taken with the nominal step size 0"):
+        integrator.step(1)
+    integrator.setStepSize(0.0005)
+    integrator.step(1)
+    assert time_of(context) == value(integrator.getStepSize()) > 0
+
+
+def test_bounds_and_step_in_any_order() -> None:
+    model = chain()
+    integrator = Custom(0.0005)
+    context = open_context(model.system(), integrator, "Reference", model)
+    integrator.setMinimumStepSize(0.001)
+    integrator.setMaximumStepSize(0.004)
+    words = "the minimum is 0.001 ps, the nominal one 0.0005 ps and the maximum 0.004 ps"
+    for act in (lambda: integrator.step(1), lambda: integrator.stepTo(0.1), integrator.reverse):
+        with pytest.raises(openmm.OpenMMException, match=words):
+            act()
+    integrator.setNominalStepSize(0.002)
+    integrator.step(3)
+    assert context.getStepCount() == 3
+    # The most recent step, or the one that was set since.
+    assert value(integrator.getStepSize()) != 0.002
+    integrator.setStepSize(0.0015)
+    assert value(integrator.getStepSize()) == 0.0015
+    # In one order and the other the run is the same.
+    ends = []
+    for order in (("Minimum", "Nominal", "Maximum"), ("Maximum", "Nominal", "Minimum")):
+        integrator = Custom(0.005)
+        for name in order:
+            getattr(integrator, f"set{name}StepSize")({"Minimum": 0.0004, "Nominal": 0.0005, "Maximum": 0.0006}[name])
+        context = open_context(model.system(), integrator, "Reference", model)
+        integrator.step(20)
+        ends.append(positions_of(context))
+    np.testing.assert_array_equal(*ends)
 
 
 def test_forces_that_are_not_numbers_raise() -> None:
@@ -556,7 +637,7 @@ def test_forces_that_are_not_numbers_raise() -> None:
     context = openmm.Context(system, integrator, openmm.Platform.getPlatform("Reference"))
     context.setPositions([[0, 0, 0], [0.1, 0, 0]])
     context.setVelocities([[1, 0, 0], [1, 0, 0]])
-    with pytest.raises(openmm.OpenMMException, match="not finite: go back to a saved state"):
+    with pytest.raises(openmm.OpenMMException, match="not finite; the Context is in the state before this step"):
         integrator.step(5000)
 
 
@@ -611,12 +692,22 @@ def test_inside_a_compound_integrator() -> None:
     assert abs(energy_of(context) - start) < 0.1
     assert part.getStepDensity() != 1
     assert part.getNumRescues() == 0
-    # The plugin's time, by itself, is the sum of the steps; here only the variable is.
+    # The plugin's time, by itself, is the sum of the steps; here only the variable is, until the steps are ours.
     alone = Custom(0.0005, constraintTolerance=1e-10)
     other = open_context(model.system(), alone, "Reference", model)
     alone.step(200)
     assert variable(part, "clock") == pytest.approx(time_of(other), rel=1e-9)
     assert largest(positions_of(context) - positions_of(other)) < 1e-9
+    with pytest.raises(openmm.OpenMMException, match="not bound to a Context"):
+        part.stepTo(1.0)
+    part.attachContext(context)
+    time = time_of(context)
+    part.stepTo(time + 0.01)
+    assert time_of(context) == pytest.approx(time + 0.01, abs=1e-15)
+    alone.stepTo(time_of(other) + 0.01)
+    assert largest(positions_of(context) - positions_of(other)) < 1e-6
+    with pytest.raises(TypeError, match="context must be a Context"):
+        part.attachContext(compound)
 
 
 def test_the_plugin_runs_where_openmm_has_a_faster_platform() -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import math
@@ -16,8 +17,8 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from .program import make_program
-from .run import Run, find_context, positions_of, vectors, velocities_of
+from .program import KEPT, make_program
+from .run import Run, find_context, positions_of, redundant_constraints, vectors, velocities_of
 from .settings import (
     BOUNDED,
     EXPLICIT,
@@ -36,12 +37,11 @@ from .settings import (
     integer,
     number,
     positive,
+    step_size,
 )
 
 __all__ = ["ConstraintWarning", "CustomVariableStepRattleIntegrator"]
 
-_KEPT = ("force", "velocity", "end")
-"""Variables of the particles with which the program notices that the state has changed."""
 _SINGLE_PRECISION_TOLERANCE = 1e-5
 """The default constraint tolerance where positions have single precision."""
 
@@ -69,6 +69,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
       ArcLength and ForceGroupEnergy. The others cannot be expressed and are refused. Explicit cannot be combined with
       monitors of the constraint force.
     - Monitors, update method and monitor force group are fixed once there is a Context; all else may change.
+    - In a CompoundIntegrator it needs to be told its Context, see attachContext().
     - No multipliers, and no virtual sites on the platforms Reference and CPU.
 
     openmm.XmlSerializer stores it as an openmm.CustomIntegrator; `cast` makes what it reads one of ours again, and
@@ -108,7 +109,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         Parameters
         ----------
         stepSize : float or Quantity
-            the nominal step size, taken where the monitor has its reference value (in ps)
+            the nominal step size, taken where the monitor has its reference value (in ps); 0 for a Context that only
+            computes energies
         updateMethod : int
             the recursion of the step density: SemiExplicit (the default), Explicit or Bounded
         minimumStepSize : float or Quantity
@@ -118,17 +120,17 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         constraintTolerance : float
             the relative tolerance of constrained distances. Default: 1e-8, or 1e-5 with positions in single precision
         monitors : list
-            the monitors in place of the default one, ConstraintForce: each a kind, or a tuple (kind, weight, power).
-            The empty list means fixed steps
+            the monitors in place of the default one, which is ConstraintForce, or ConstraintAndAppliedForce in a System
+            without constraints: each a kind, or a tuple (kind, weight, power). The empty list means fixed steps
         referenceMonitorValue : float
             the value of the first monitor at which the nominal step is taken; 0 (the default) means that it is taken
-            at the first step
+            at the first step at which the monitor is above rounding
         normOrder : float
             the order p of the monitor ForcePNorm. Default: 8
         monitorForceGroup : int
             the force group whose energy is the monitor ForceGroupEnergy. Default: 31
         """
-        nominal = positive(number(stepSize, "stepSize", unit.picosecond), "the nominal step size", "ps")
+        nominal = step_size(stepSize, "stepSize")
         super().__init__(nominal)
         super().setConstraintTolerance(1e-8)
         self._install(Settings(nominal))
@@ -167,14 +169,17 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         Parameters
         ----------
         size : float or Quantity
-            the nominal step size (in ps): positive, and between the step bounds where these have been set
+            the nominal step size (in ps). Nominal step and bounds can be set in any order; the next step raises an
+            exception if it does not lie between them
         """
         settings = self._settings()
-        settings.nominal = positive(number(size, "size", unit.picosecond), "the nominal step size", "ps")
+        settings.nominal = step_size(size, "size")
         self._change(settings)
+        self._set("step", settings.nominal)
 
     def getStepSize(self) -> unit.Quantity:
-        """Get the size of the most recent step, or the nominal step size before the first step."""
+        """Get the size of the most recent step, or the nominal step size if it has been set since, or before the first
+        step."""
         size = self._get("step") if self._get("started") else self._get("nominalStep")
         return unit.Quantity(size, unit.picosecond)
 
@@ -273,6 +278,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
     def getMonitor(self, index: int) -> list[Any]:
         """Get kind, weight and power of a monitor."""
         monitor = self._settings().monitors[self._monitor_index(index)]
+        if monitor.is_default and self._get("applies"):
+            return [self.ConstraintAndAppliedForce, monitor.weight, monitor.power]
         return [monitor.kind, monitor.weight, monitor.power]
 
     def getMonitorForceGroup(self) -> int:
@@ -306,7 +313,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         self._change(settings)
 
     def getReferenceMonitorValue(self, index: int = 0) -> float:
-        """Get the reference value of a monitor: the value in force, 0 if none was set and no step has been taken."""
+        """Get the reference value of a monitor: the value in force, 0 if none was set and the monitor has been zero in
+        all steps so far."""
         return self._get(f"reference{self._monitor_index(index)}")
 
     def setReferenceMonitorValue(self, value: float, index: int = 0) -> None:
@@ -315,8 +323,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         Parameters
         ----------
         value : float
-            the reference value in the monitor's unit; 0 means that it is taken at the next step, which starts the
-            density afresh
+            the reference value in the monitor's unit; 0 means that it is taken at the next step at which the monitor
+            is above rounding, and starts the density afresh
         index : int
             the index of the monitor
         """
@@ -340,8 +348,12 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         self._set("toleranceSet", 1.0)
 
     def getIntegrationForceGroups(self) -> int:
-        """Get which force groups to use for integration, as a set of bit flags."""
-        return int(self._get("forceGroups"))
+        """Get which force groups to use for integration, as a set of bit flags: without that of a monitor."""
+        groups = self._chosen_force_groups()
+        settings = self._settings()
+        if settings.uses("ForceGroupEnergy"):
+            groups &= ~(1 << settings.group)
+        return _signed(groups)
 
     def setIntegrationForceGroups(self, groups: int | set) -> None:
         """Set which force groups to use for integration, before the first step: bit flags, or a set of groups."""
@@ -349,10 +361,12 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             raise error("the integration force groups cannot change after the first step: make another integrator")
         if isinstance(groups, (set, frozenset)):
             groups = functools.reduce(operator.or_, (1 << integer(group, "group") for group in groups), 0)
-        # As OpenMM returns them: a signed integer of 32 bits.
-        groups = integer(groups, "groups") & 0xFFFFFFFF
-        self._set("forceGroups", float(groups - (1 << 32) if groups >> 31 else groups))
-        self._apply_force_groups(self._settings())
+        self._set("forceGroups", float(_signed(integer(groups, "groups"))))
+        self._apply_force_groups()
+
+    def _chosen_force_groups(self) -> int:
+        """Those that were set, whatever the monitor, as bits."""
+        return int(self._get("forceGroups")) & 0xFFFFFFFF
 
     # What a run has come to
 
@@ -408,7 +422,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         """
         steps = integer(steps, "steps")
         run = self._enter()
-        if run is None:
+        if run is None:  # there is no Context, which OpenMM says, or a CompoundIntegrator's
             super().step(steps)
             return
         try:
@@ -437,7 +451,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         run = self._enter(required=True)
         try:
             while self._get("clock") < time:
-                saved = self._save(run.context, with_particles=False)
+                saved = self._variables()
                 self._advance(run, 1)
                 size, clock = self._get("step"), self._get("clock")
                 if clock > time - 1e-6 * size:
@@ -457,14 +471,19 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         if not self._get("started"):
             context.setVelocities(-velocities_of(context))
             return
-        saved = self._save(context)
-        openmm.CustomIntegrator.step(self, 1)
-        after = self._variables()
+        # A copy, since a step overwrites it: the velocities with which the program notices changes.
+        known = np.array(self.getPerDofVariableByName(PREFIX + "velocity"))
+        velocities = velocities_of(context)
+        saved = context.createCheckpoint()
+        try:
+            self._take(context)
+            after = self._variables()
+        finally:
+            context.loadCheckpoint(saved)
         fresh = bool(after["fresh"])
-        self._restore(context, saved)
         self._set("evaluations", after["evaluations"] + 1)
-        context.setVelocities(-saved["velocities"])
-        self.setPerDofVariableByName(PREFIX + "velocity", vectors(-np.array(saved["velocity"])))
+        context.setVelocities(-velocities)
+        self.setPerDofVariableByName(PREFIX + "velocity", vectors(-known))
         if fresh:  # The user had changed the state: there is no sequence of densities to turn round.
             self._set("started", 0.0)
             return
@@ -491,21 +510,41 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         monitors = self._settings().monitors
         if steps <= 0 or not monitors:
             raise error("calibrate() needs a monitor and a positive number of steps")
-        saved = self._save(run.context)
+        context = run.context
+        saved = context.createCheckpoint()
         sums = np.zeros(len(monitors))
-        for _ in range(steps):
-            self._set("prescribed", 1.0)
-            openmm.CustomIntegrator.step(self, 1)
-            sums += [self._monitor_value(monitor) for monitor in monitors]
-        evaluations = self._get("evaluations")
-        self._restore(run.context, saved)
+        try:
+            if not self._get("started"):
+                self._apply_constraints(context)
+            for _ in range(steps):
+                self._set("prescribed", 1.0)
+                self._take(context)
+                sums += [self._monitor_value(monitor) for monitor in monitors]
+            evaluations = self._get("evaluations")
+        finally:
+            context.loadCheckpoint(saved)
         self._set("evaluations", evaluations)
-        if not (np.all(np.isfinite(sums)) and np.all(sums > 0)):
-            raise error(
-                "the trial run of fixed steps failed, or a monitor vanished in it: take a smaller nominal step size"
-            )
         for index, mean in enumerate(sums / steps):
-            self.setReferenceMonitorValue(float(mean), index)
+            if mean > 0:  # otherwise it is taken as soon as it is
+                self.setReferenceMonitorValue(float(mean), index)
+
+    def attachContext(self, context: openmm.Context) -> None:
+        """Tell the integrator its Context, where it cannot find it: as a member of a CompoundIntegrator.
+
+        There step(), stepTo(), reverse() and calibrate() of this object are ours, while the steps of the
+        CompoundIntegrator are without the checks of constraints, and on the platforms Reference and CPU do not set the
+        time of the Context right.
+
+        Parameters
+        ----------
+        context : Context
+            the Context that was made with this integrator, or with the CompoundIntegrator of which it is a member
+        """
+        if not isinstance(context, openmm.Context):
+            raise TypeError(f"context must be a Context, not {context!r}")
+        self._run = Run(context, self._settings())
+        self._set("applies", float(self._run.applies_default))
+        self._fit_tolerances(self._run)
 
     # Copies
 
@@ -543,7 +582,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             )
         integrator.__class__ = cls
         if not integrator._is_fixed():
-            integrator._install(integrator._settings())
+            integrator._install(integrator._settings(), integrator._chosen_force_groups())
         return integrator
 
     def __copy__(self) -> CustomVariableStepRattleIntegrator:
@@ -556,7 +595,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
     def __getstate__(self) -> tuple[Any, ...]:
         attributes = {name: value for name, value in self.__dict__.items() if name not in ("this", "_run")}
-        numbers = (self.getConstraintTolerance(), self.getIntegrationForceGroups(), self.getRandomNumberSeed())
+        numbers = (self.getConstraintTolerance(), self._chosen_force_groups(), self.getRandomNumberSeed())
         return self._settings(), numbers, self.getKineticEnergyExpression(), attributes
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -597,20 +636,16 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
     def _install(self, settings: Settings, groups: int | None = None) -> None:
         """Put another CustomIntegrator with the program of these settings behind this Python object."""
         if groups is None:
-            variables = self._variables()
-            groups = int(variables.get("forceGroups", super().getIntegrationForceGroups()))
-        fresh = make_program(settings).make(settings.nominal, {"forceGroups": float(groups)})
+            groups = int(self._variables().get("forceGroups", -1))
+        fresh = make_program(settings).make(settings.nominal, {"forceGroups": float(_signed(groups))})
         fresh.setConstraintTolerance(self.getConstraintTolerance())
         fresh.setRandomNumberSeed(self.getRandomNumberSeed())
         fresh.setKineticEnergyExpression(self.getKineticEnergyExpression())
         self.this = fresh.this
-        self._apply_force_groups(settings)
+        self._apply_force_groups()
 
-    def _apply_force_groups(self, settings: Settings) -> None:
-        groups = self.getIntegrationForceGroups() & 0xFFFFFFFF
-        if settings.uses("ForceGroupEnergy"):
-            groups &= ~(1 << settings.group)
-        super().setIntegrationForceGroups(groups)
+    def _apply_force_groups(self) -> None:
+        super().setIntegrationForceGroups(self.getIntegrationForceGroups())
 
     def _rebuild(self, settings: Settings) -> None:
         """Take new settings that need another program."""
@@ -641,8 +676,9 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
     def _monitor_value(self, monitor: Monitor) -> float:
         values = self._variables()
         constraint, applied, force = values["constraintMinus"], values["applied"], values["forceSquared"]
+        default = applied * values["applies"] if monitor.is_default else 0.0
         return {
-            "ConstraintForce": lambda: math.sqrt(constraint),
+            "ConstraintForce": lambda: math.sqrt(constraint + default),
             "AppliedForce": lambda: math.sqrt(applied),
             "ConstraintAndAppliedForce": lambda: math.sqrt(constraint + applied),
             "ForcePNorm": lambda: math.sqrt(force) * values["norm"] ** (1 / values["normOrder"]),
@@ -656,16 +692,17 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
     def _enter(self, required: bool = False) -> Run | None:
         """Prepare for steps: find the Context, and take over the time that it has."""
         run = self.__dict__.get("_run")
-        context = run.context if run is not None else None
-        if context is None:
+        if run is None or run.context is None:
             context = find_context(self)
             if context is None:
                 if required:
                     raise error("this integrator is not bound to a Context")
                 return None
-            run = self._run = Run(context)
-            self._fit_tolerances(run)
-        time = context.getTime()._value
+            self.attachContext(context)
+            run = self._run
+        if self._get("conflict"):
+            raise error(str(self._settings().conflict()))
+        time = run.context.getTime()._value
         if time != self._get("clock"):
             self._set("clock", time)
         if self._get("started"):
@@ -682,17 +719,85 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
     def _advance(self, run: Run, steps: int) -> None:
         """Take steps, the first of which may be a first one of a sequence of densities."""
-        if not self._get("started"):
-            # As every run starts: on the constraints.
-            run.context.applyConstraints(self.getConstraintTolerance())
-            run.context.applyVelocityConstraints(self.getConstraintTolerance())
+        context, before, taken = run.context, None, 0
         self._fit_tolerances(run)
-        openmm.CustomIntegrator.step(self, 1)
-        if self._get("fresh"):
-            self._improve_start(run)
+        is_start = not self._get("started")
+        if is_start or run.keeps_variables:
+            before = positions_of(context), velocities_of(context)
+        try:
+            if is_start:
+                self._apply_constraints(context)
+            self._take(context)
+            if self._get("fresh"):
+                self._improve_start(run)
+                run.begin()
+                self._check(run, 1)
+                taken = 1
+        except BaseException:
+            if before is not None:
+                context.setPositions(before[0])
+                context.setVelocities(before[1])
+            raise
         if steps > 1:
-            openmm.CustomIntegrator.step(self, steps - 1)
-        self._check_state(run, steps)
+            self._take(context, steps - 1)
+        if steps > taken:
+            self._check(run, steps - taken)
+
+    def _apply_constraints(self, context: openmm.Context) -> None:
+        """Put the state onto the constraints, as at the start of every run."""
+        context.applyConstraints(self.getConstraintTolerance())
+        context.applyVelocityConstraints(self.getConstraintTolerance())
+
+    def _take(self, context: openmm.Context, steps: int = 1) -> None:
+        """Take steps; if one cannot be completed, the Context is in the state before that one."""
+        try:
+            openmm.CustomIntegrator.step(self, steps)
+        except BaseException:
+            if self._get("moved"):
+                self._undo(context, self._kept())
+            elif self._run.keeps_variables:  # They are those after the last step that was completed, and so are these.
+                self._put_back(context, "end", "velocity")
+            raise
+        if self._get("lost"):
+            skipped = int(self._get("skipped"))
+            self._set("lost", 0.0)
+            self._set("skipped", 0.0)
+            context.setStepCount(context.getStepCount() - skipped)
+            if skipped == steps:  # what was found at the beginning is not the result of a step of ours
+                raise error("no step can be taken, as positions, velocities or forces are not finite")
+        elif math.isfinite(self._get("total")):
+            return
+        self._undo(context, self._kept())
+        context.setStepCount(context.getStepCount() - 1)
+        positions = positions_of(context)
+        raise error(
+            "a step could not be taken, as forces, monitors or the constraint solver gave numbers that are not finite; "
+            "the Context is in the state before this step: "
+            + (redundant_constraints(context.getSystem(), positions) or "take a smaller nominal step size")
+        )
+
+    def _kept(self) -> dict[str, float]:
+        """The variables as they were before the last step."""
+        return {name[len(KEPT) :]: value for name, value in self._variables().items() if name.startswith(KEPT)}
+
+    def _undo(self, context: openmm.Context, variables: dict[str, float]) -> None:
+        """Go back to the particles before the last step, and to variables."""
+        self._put_back(context, "start", "startVelocity")
+        if not self._get("moved"):
+            # The step was completed, so the program would take this state for one that the user has changed.
+            self._know_state(context)
+        for name, value in variables.items():
+            self._set(name, value)
+        self._set("moved", 0.0)
+
+    def _know_state(self, context: openmm.Context) -> None:
+        """Let the state before the last step be the one to which the next step compares what it finds."""
+        for name, start in (("velocity", "startVelocity"), ("end", "start")):
+            self.setPerDofVariableByName(PREFIX + name, self.getPerDofVariableByName(PREFIX + start))
+        groups = self.getIntegrationForceGroups()
+        with contextlib.suppress(openmm.OpenMMException):  # then the density starts afresh
+            forces = context.getState(forces=True, groups=groups).getForces(asNumpy=True)._value
+            self.setPerDofVariableByName(PREFIX + "force", vectors(forces))
 
     def _improve_start(self, run: Run) -> None:
         """Take the first step again with a density that starts no oscillation, if it was not of its own making.
@@ -701,91 +806,99 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         and has to be (7.1) of docs/method.md, for which u after the step is known now.
         """
         settings, values = self._settings(), self._variables()
-        if not settings.monitors:
+        if not settings.monitors or not all(values[f"reference{k}"] > 0 for k in range(len(settings.monitors))):
             return
-        # A constraint force that is rounding and nothing else changes velocities in a step by less than this.
-        rounding = 1e-7 * run.speed() / values["step"]
-        for k, monitor in enumerate(settings.monitors):
-            measured = monitor.name == "ConstraintForce" and not monitor.reference
-            if values[f"reference{k}"] > (rounding if measured else 0.0):
-                continue
-            self._take_back(run.context)
-            self._set(f"reference{k}", 0.0)
-            raise error(
-                "a monitor vanishes at the start, where its reference value would be taken: set a reference value"
-            )
         here, after = (density_of(settings, values, name) for name in ("mean", "next"))
         wanted = (here + after) / 2
         if not 0.5 * here < wanted < 2 * here or math.isclose(wanted, values["density"], rel_tol=1e-9):
             return
         if all(monitor.reference == 0 for monitor in settings.monitors) and values["density"] == 1:
             return
+        before = self._kept()
         self._take_back(run.context)
         self._set("prescribed", wanted)
-        openmm.CustomIntegrator.step(self, 1)
+        try:
+            self._take(run.context)
+        except BaseException:
+            self._undo(run.context, before)
+            raise
+
+    def _put_back(self, context: openmm.Context, position: str, velocity: str) -> None:
+        """Set positions and velocities to those in two variables of the particles."""
+        system = context.getSystem()
+        moving = np.array([system.getParticleMass(i)._value > 0 for i in range(system.getNumParticles())])[:, None]
+        positions = np.array(self.getPerDofVariableByName(PREFIX + position))
+        velocities = np.array(self.getPerDofVariableByName(PREFIX + velocity))
+        context.setPositions(np.where(moving, positions, positions_of(context)))
+        context.setVelocities(np.where(moving, velocities, 0.0))
+        context.computeVirtualSites()
 
     def _take_back(self, context: openmm.Context) -> None:
         """Go back to the state before the last step, with which the program has begun it."""
-        system = context.getSystem()
-        moving = np.array([system.getParticleMass(i)._value > 0 for i in range(system.getNumParticles())])[:, None]
-        start = np.array(self.getPerDofVariableByName(PREFIX + "start"))
-        velocity = np.array(self.getPerDofVariableByName(PREFIX + "startVelocity"))
-        context.setPositions(np.where(moving, start, positions_of(context)))
-        context.setVelocities(np.where(moving, velocity, 0.0))
-        context.computeVirtualSites()
+        self._put_back(context, "start", "startVelocity")
         context.setStepCount(context.getStepCount() - 1)
         self._set("clock", self._get("clock") - self._get("step"))
         self._set_time(context)
         self._set("started", 0.0)
 
-    def _shorten(self, run: Run, saved: dict[str, Any], time: float) -> None:
+    def _shorten(self, run: Run, saved: dict[str, float], time: float) -> None:
         """Take the last step, which reached or passed the time, once more and end it at the time."""
-        remaining, full = time - saved["variables"]["clock"], self._get("step")
-        before, after = saved["variables"]["density"], self._get("density")
+        remaining, full = time - saved["clock"], self._get("step")
+        before, after = saved["density"], self._get("density")
         evaluations, fresh = self._get("evaluations"), self._get("fresh")
         self._take_back(run.context)
-        for name, value in saved["variables"].items():
+        for name, value in saved.items():
             self._set(name, value)
         for name, start in (("velocity", "startVelocity"), ("end", "start")):
             self.setPerDofVariableByName(PREFIX + name, self.getPerDofVariableByName(PREFIX + start))
         self._set("prescribed", self._get("nominalStep") / remaining)
         self._set("entering", 0.0)
-        openmm.CustomIntegrator.step(self, 1)
+        try:
+            self._take(run.context)
+        except BaseException:
+            self._undo(run.context, saved)
+            raise
         # The density moves by the part of a full step.
         self._set("density", after if fresh else before + (after - before) * min(1.0, remaining / full))
         self._set("pending", 2.0)
         self._set("clock", time)
         self._set("evaluations", evaluations + 2)
 
-    def _save(self, context: openmm.Context, with_particles: bool = True) -> dict[str, Any]:
-        saved: dict[str, Any] = {"variables": self._variables()}
-        if with_particles:
-            saved |= {"positions": positions_of(context), "velocities": velocities_of(context)}
-            saved |= {"time": context.getTime(), "count": context.getStepCount()}
-            for name in _KEPT:
-                saved[name] = self.getPerDofVariableByName(PREFIX + name)
-        return saved
-
-    def _restore(self, context: openmm.Context, saved: dict[str, Any]) -> None:
-        for name, value in saved["variables"].items():
-            self._set(name, value)
-        context.setPositions(saved["positions"])
-        context.setVelocities(saved["velocities"])
-        context.setTime(saved["time"])
-        context.setStepCount(saved["count"])
-        for name in _KEPT:
-            self.setPerDofVariableByName(PREFIX + name, saved[name])
-
     def _set_time(self, context: openmm.Context) -> None:
         # On Reference and CPU the Context's time advances by the step size with which the Context was made.
         context.setTime(self._get("clock"))
 
-    def _check_state(self, run: Run, steps: int) -> None:
-        """Raise or warn if something has gone wrong."""
-        if not all(math.isfinite(self._get(name)) for name in ("density", "clock", "uMinus")):
-            raise error(
-                "a step could not be taken, as forces, monitors or the constraint solver gave numbers that are not "
-                "finite: go back to a saved state and take a smaller nominal step size"
-            )
-        for message in run.check(steps, self.getConstraintTolerance(), int(self._get("rescues"))):
+    def _check(self, run: Run, steps: int) -> None:
+        """Raise or warn if the constraint solver does not do its work, after some steps."""
+        messages, failure = run.check(steps, self.getConstraintTolerance(), int(self._get("rescues")))
+        if failure is not None:
+            raise error(f"{failure}; {self._go_back(run)}")
+        for message in messages:
             warnings.warn(message, ConstraintWarning, stacklevel=4)
+
+    def _go_back(self, run: Run) -> str:
+        """Go back to the last state whose constraints were met, and say so."""
+        context = run.context
+        if run.good is None:  # the first step of a sequence
+            self._undo(context, self._kept())
+            context.setStepCount(context.getStepCount() - 1)
+            return "the Context is in the state before this step"
+        # What the user has set since is not part of that state.
+        settings, parameters = self._settings(), dict(context.getParameters())
+        context.loadCheckpoint(run.good)
+        for name, value in parameters.items():
+            if context.getParameter(name) != value:
+                context.setParameter(name, value)
+        if settings != self._settings():
+            self._change(settings)
+        run.begin()
+        return (
+            f"the Context is in the state after step {context.getStepCount():,}, the last one whose constraints are "
+            "known to have been met"
+        )
+
+
+def _signed(groups: int) -> int:
+    """Force groups as OpenMM returns them: the bits as a signed integer of 32 bits."""
+    groups &= 0xFFFFFFFF
+    return groups - (1 << 32) if groups >> 31 else groups

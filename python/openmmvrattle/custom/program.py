@@ -88,9 +88,12 @@ _RUN = {
     "started": 0.0,  # whether there is a last step
     "fresh": 0.0,  # whether the last step was a first one
     "entering": 0.0,  # set by step(): the user may have changed the state since the last step
-    "restart": 0.0,  # whether the user has
     "changed": 0.0,  # positive if positions, velocities or forces differ from those after the last step
     "change": 0.0,  # whether u has changed since the last step, for that reason or because of new settings
+    "lost": 0.0,  # whether the last step has led to something that is not finite; then no more are taken
+    "skipped": 0.0,  # how many have not been taken for that reason
+    "total": 0.0,  # finite if all is that the last step has led to
+    "moved": 0.0,  # whether a step is under way: an exception then leaves the particles anywhere
     "pending": 0.0,  # 1: settings have changed; 2: only the backward constraint force is to be computed anew
     "prescribed": 0.0,  # density of the next step; 0 if it is to be found
     "known": 0.0,  # whether all reference values are known
@@ -131,52 +134,89 @@ _RUN = {
     "norm": 0.0,
     "scale": 0.0,
     "energy": 0.0,
+    "candidate": 0.0,  # a reference value that may be taken, and the rounding that it has to be above
+    "rounding": 0.0,
+    "applies": 0.0,  # whether the default monitor includes the applied force: where there are no constraints
 }
+KEPT = "kept_"
+"""What begins the names of variables that hold, during a step, the values from before it."""
+_OF_ONE_STEP = {
+    *("entering", "fresh", "changed", "change", "known", "phase", "nextPhase", "back", "sigma", "trial", "iterate"),
+    *("count", "solved", "failed", "target", "residual", "lastTrial", "lastTarget", "lastResidual", "uPlus", "uOld"),
+    *("pass", "constraintPlus", "kineticPlus", "speedPlus", "candidate", "rounding", "applies", "scale"),
+    *("lost", "skipped", "moved", "total", "solverTolerance"),
+}
+"""Variables of the run that no later step depends on, or that the program does not change."""
 
 
 def make_program(settings: Settings) -> Program:
     """The program of an integrator with these settings."""
     program = Program(per_dof=["start", "startVelocity", "force", "velocity", "end"])
-    program.variables = settings.globals() | _RUN
+    program.variables = settings.globals() | _RUN | {"step": settings.nominal}
+    kept = [name for name in _RUN if name not in _OF_ONE_STEP]
     for k, monitor in enumerate(settings.monitors):
         program.variables[f"reference{k}"] = monitor.reference
+        kept.append(f"reference{k}")
         # U at the start, its change over the half steps around it, and U at the next step: for the start of the
         # density.
         program.variables |= {f"mean{k}": 0.0, f"half{k}": 0.0, f"next{k}": 0.0}
-    _begin(program, settings)
-    if settings.is_iterative:
-        _solve(program, settings)
-    else:
-        _step_explicitly(program, settings)
-    _finish(program, settings)
+    program.variables |= {KEPT + name: 0.0 for name in kept}
+    _notice_changes(program)
+    with program.block("$lost > 0"):
+        program.compute("$skipped", "$skipped + 1")
+    with program.block("$lost <= 0"):
+        _keep(program, kept)
+        _begin(program, settings)
+        if settings.is_iterative:
+            _solve(program, settings)
+        else:
+            _step_explicitly(program, settings)
+        _finish(program, settings)
     return program
 
 
-def _begin(program: Program, settings: Settings) -> None:
-    """Notice changes of the state, and store positions, velocities and forces, with which passes are repeated."""
+def _notice_changes(program: Program) -> None:
+    """Notice changes of the state by the user or by a Force, and whether the last step has lost it."""
     velocity = "(v-$velocity)^2 + ($step*(f-$force)/m)^2"
     # On a GPU molecules are moved back into the periodic box now and then, by a length of the box: that is no change.
     position = "select(step(0.3 - abs(x-$end)), ((x-$end)/$step)^2, 0)"
     difference = f"m*({velocity} + {position} - {CHANGE}*(v^2 + ($step*f/m)^2))"
     with program.block("$entering > 0"):
-        program.compute("$entering", "0")
+        # Before anything is changed: a force may raise an exception here.
         program.sum("$changed", difference)
+        program.compute("$entering", "0")
         with program.block("$changed > 0"):
             program.compute("$started", "0")
             program.constrain_positions()
             program.constrain_velocities()
     program.update_context_state()
     program.sum("$changed", difference)
+    # No comparison holds for what is not a number.
+    program.compute("$lost", "1")
+    with program.block("abs($changed) < 1e300"):
+        program.compute("$lost", "0")
+
+
+def _keep(program: Program, names: list[str]) -> None:
+    """Keep what is needed to go back to the state before this step, and to repeat passes from it."""
+    for name in names:
+        program.compute(f"${KEPT}{name}", f"${name}")
+    program.per_particle("$start", "x")
+    program.per_particle("$startVelocity", "v")
+    program.compute("$moved", "1")
+
+
+def _begin(program: Program, settings: Settings) -> None:
+    """The forces, and after a change of the state what depends on it."""
     program.compute("$change", "max(1 - $started, max(1 - step(-$changed), min($pending, 1)))")
     program.per_particle("$force", "f")
-    program.per_particle("$start", "x")
     with program.block("$change > 0"):
         program.constrain_velocities()
+        program.per_particle("$startVelocity", "v")
         _energy(program, settings)
         _position_sums(program, settings, "$force")
         if not settings.is_iterative:
             _velocity_sums(program, settings)
-    program.per_particle("$startVelocity", "v")
     program.compute("$fresh", "1 - $started")
     known = [f"(1 - step(-$reference{k}))" for k in range(len(settings.monitors))]
     program.compute("$known", "*".join(known) or "1")
@@ -193,6 +233,9 @@ def _position_sums(program: Program, settings: Settings, force: str) -> None:
     """Sums that depend on positions alone, with the forces in the variable `force`."""
     if settings.uses("AppliedForce", "ConstraintAndAppliedForce"):
         program.sum("$applied", f"{force}^2/m")
+    elif settings.has_default:
+        with program.block("$applies > 0"):
+            program.sum("$applied", f"{force}^2/m")
     if settings.uses("VectorField", "ArcLength", "ForcePNorm"):
         program.sum("$forceSquared", f"{force}^2")
     if settings.uses("ForcePNorm"):
@@ -214,7 +257,7 @@ def _velocity_sums(program: Program, settings: Settings) -> None:
 def _raw(monitor: Monitor, which: str) -> str:
     """U of a monitor, from the sums of the half step before (Minus) or after (Plus)."""
     return {
-        "ConstraintForce": f"sqrt($constraint{which})",
+        "ConstraintForce": f"sqrt($constraint{which}{' + $applies*$applied' if monitor.is_default else ''})",
         "AppliedForce": "sqrt($applied)",
         "ConstraintAndAppliedForce": f"sqrt($constraint{which} + $applied)",
         "ForcePNorm": "sqrt($forceSquared)*$norm^(1/$normOrder)",
@@ -228,7 +271,11 @@ def _u(settings: Settings, which: str) -> str:
     """u = B(U_rel) of docs/method.md, sections 5 and 6."""
     if not settings.monitors:
         return "1"
-    relative = [f"(({_raw(m, which)})/$reference{k})^$power{k}" for k, m in enumerate(settings.monitors)]
+    # A monitor without a reference value asks for nothing.
+    relative = [
+        f"select($reference{k}, (({_raw(m, which)})/$reference{k})^$power{k}, 1)"
+        for k, m in enumerate(settings.monitors)
+    ]
     if len(relative) > 1:
         terms = " + ".join(f"($weight{k}*{each})^2" for k, each in enumerate(relative))
         weights = " + ".join(f"$weight{k}^2" for k in range(len(relative)))
@@ -447,11 +494,37 @@ def _finish(program: Program, settings: Settings) -> None:
     with program.block("$fresh > 0"):
         for k, monitor in enumerate(settings.monitors):
             compute(f"$next{k}", f"{_raw(monitor, 'Minus')} + $half{k}")
-            with program.block(f"$reference{k} <= 0"):
-                compute(f"$reference{k}", f"($mean{k} + $next{k})/2")
+    for k, monitor in enumerate(settings.monitors):
+        with program.block(f"$reference{k} <= 0"):
+            _take_reference(program, k, monitor)
     compute("$uMinus", _u(settings, "Minus"))
     compute("$density", "$trial")
+    _sum_up(program, settings)
     compute("$clock", "$clock + $step")
     compute("$evaluations", "$evaluations + 1 + $fresh")
-    for name, value in (("started", "1"), ("pending", "0"), ("prescribed", "0")):
+    for name, value in (("started", "1"), ("pending", "0"), ("prescribed", "0"), ("moved", "0")):
         compute("$" + name, value)
+
+
+def _sum_up(program: Program, settings: Settings) -> None:
+    """A number that is finite only if the step has led to forces and velocities that are."""
+    if settings.uses_constraint_force or settings.uses("AppliedForce", "VectorField", "ArcLength", "ForcePNorm"):
+        program.compute("$total", "$density + $uMinus + $constraintMinus + $applied + $forceSquared + $energy")
+    else:
+        program.sum("$pass", "v^2")
+        program.compute("$total", "$density + $uMinus + $energy + $pass")
+
+
+def _take_reference(program: Program, k: int, monitor: Monitor) -> None:
+    """Take the reference value of a monitor as soon as the monitor is above rounding.
+
+    A start at rest is calm, so the steps are nominal until then.
+    """
+    program.compute("$candidate", f"select($fresh, ($mean{k} + $next{k})/2, {_raw(monitor, 'Minus')})")
+    program.compute("$rounding", "0")
+    if monitor.name in ("ConstraintForce", "ConstraintAndAppliedForce"):
+        # A constraint force that is rounding and nothing else changes velocities in a step by less than this.
+        program.sum("$pass", "m*v^2")
+        program.compute("$rounding", "1e-7*sqrt($pass)/$step")
+    with program.block("$candidate > $rounding"):
+        program.compute(f"$reference{k}", "$candidate")

@@ -12,7 +12,7 @@ import openmm
 from openmm import unit
 
 PREFIX = "vrattle_"
-VERSION = 1
+VERSION = 2
 SEMI_EXPLICIT, EXPLICIT, BOUNDED = 0, 1, 2
 MONITOR_KINDS = (
     "ConstraintMultipliers",
@@ -47,6 +47,8 @@ class Monitor:
     weight: float = 1.0
     power: float = 1.0
     reference: float = 0.0
+    is_default: bool = False
+    """Whether nobody has named it: then it is that of the applied force too, where there are no constraints."""
 
     @property
     def name(self) -> str:
@@ -61,7 +63,9 @@ class Settings:
     minimum: float = -1.0
     maximum: float = -1.0
     update: int = SEMI_EXPLICIT
-    monitors: list[Monitor] = field(default_factory=lambda: [Monitor(MONITOR_KINDS.index("ConstraintForce"))])
+    monitors: list[Monitor] = field(
+        default_factory=lambda: [Monitor(MONITOR_KINDS.index("ConstraintForce"), is_default=True)]
+    )
     order: float = 8.0
     group: int = 31
     tolerance_set: bool = False
@@ -77,6 +81,11 @@ class Settings:
     def uses(self, *names: str) -> bool:
         """Whether one of the monitors is of one of these kinds."""
         return any(monitor.name in names for monitor in self.monitors)
+
+    @property
+    def has_default(self) -> bool:
+        """Whether the monitor that nobody has named is in use."""
+        return any(monitor.is_default for monitor in self.monitors)
 
     @property
     def uses_constraint_force(self) -> bool:
@@ -103,12 +112,14 @@ class Settings:
             "energyGroup": float(self.group),
             "toleranceSet": float(self.tolerance_set),
             "monitors": float(len(self.monitors)),
+            "conflict": float(self.conflict() is not None),
         }
         for k, monitor in enumerate(self.monitors):
             result[f"kind{k}"] = float(monitor.kind)
             result[f"weight{k}"] = monitor.weight
             result[f"power{k}"] = monitor.power
             result[f"setReference{k}"] = monitor.reference
+            result[f"default{k}"] = float(monitor.is_default)
         return result | self.bounds()
 
     @staticmethod
@@ -120,7 +131,13 @@ class Settings:
             maximum=values["maximumStep"],
             update=int(values["updateMethod"]),
             monitors=[
-                Monitor(int(values[f"kind{k}"]), values[f"weight{k}"], values[f"power{k}"], values[f"setReference{k}"])
+                Monitor(
+                    int(values[f"kind{k}"]),
+                    values[f"weight{k}"],
+                    values[f"power{k}"],
+                    values[f"setReference{k}"],
+                    bool(values[f"default{k}"]),
+                )
                 for k in range(int(values["monitors"]))
             ],
             order=values["normOrder"],
@@ -128,13 +145,27 @@ class Settings:
             tolerance_set=bool(values["toleranceSet"]),
         )
 
+    def conflict(self) -> str | None:
+        """Why no step can be taken with this nominal step and these bounds, or None if there is no reason."""
+        if self.nominal == 0:
+            return "no step can be taken with the nominal step size 0, which is for a Context that computes energies"
+        low, high = self.minimum_in_force, self.maximum_in_force
+        if (low == 0 or low < self.nominal) and (high == 0 or self.nominal < high):
+            return None
+        return (
+            "the nominal step size must be larger than the minimum and smaller than the maximum one: the minimum is "
+            f"{low:g} ps, the nominal one {self.nominal:g} ps and the maximum {high:g} ps (0: no bound)"
+        )
+
     def bounds(self) -> dict[str, float]:
         """What the Moebius function B of docs/method.md, section 6, is computed from, and the a of the bounded
         update."""
-        a = self.nominal / self.maximum_in_force if self.maximum_in_force > 0 else 0.0
+        maximum = self.maximum_in_force if self.conflict() is None else 0.0
+        minimum = self.minimum_in_force if self.conflict() is None else 0.0
+        a = self.nominal / maximum if maximum > 0 else 0.0
         lower = min(4 * a / 3, (1 + 2 * a) / 3) if self.update == BOUNDED else a
-        if self.minimum_in_force > 0:
-            upper = self.nominal / self.minimum_in_force
+        if minimum > 0:
+            upper = self.nominal / minimum
             curvature = (1 - lower) / (upper - 1)
             slope = upper * curvature
         else:
@@ -153,7 +184,8 @@ def density_of(settings: Settings, values: dict[str, float], name: str) -> float
     """u = B(U_rel) from values U_k that have a name in the program."""
     total = weights = 0.0
     for k, monitor in enumerate(settings.monitors):
-        relative = (values[f"{name}{k}"] / values[f"reference{k}"]) ** monitor.power
+        reference = values[f"reference{k}"]
+        relative = (values[f"{name}{k}"] / reference) ** monitor.power if reference > 0 else 1.0
         total += (monitor.weight * relative) ** 2
         weights += monitor.weight**2
     relative = math.sqrt(total / weights)
@@ -162,17 +194,7 @@ def density_of(settings: Settings, values: dict[str, float], name: str) -> float
 
 
 def check(settings: Settings) -> None:
-    """Raise an OpenMMException if settings do not fit together."""
-    if settings.minimum > 0 and settings.minimum >= settings.nominal:
-        raise error(
-            f"the minimum step size ({settings.minimum:g} ps) must be smaller than the nominal one "
-            f"({settings.nominal:g} ps)"
-        )
-    if settings.maximum > 0 and settings.maximum <= settings.nominal:
-        raise error(
-            f"the maximum step size ({settings.maximum:g} ps) must be larger than the nominal one "
-            f"({settings.nominal:g} ps)"
-        )
+    """Raise an OpenMMException if update and monitors do not fit together."""
     if settings.update == EXPLICIT and settings.uses_constraint_force:
         raise error(
             "the update Explicit needs the constraint force before the step is taken, which a CustomIntegrator does "
@@ -210,6 +232,14 @@ def integer(value: object, name: str) -> int:
 def positive(value: float, name: str, unit_name: str = "") -> float:
     if not (math.isfinite(value) and value > 0):
         raise error(f"{name} must be positive and finite, not {value:g}{' ' + unit_name if unit_name else ''}")
+    return value
+
+
+def step_size(size: float | unit.Quantity, name: str) -> float:
+    """A nominal step size in ps; 0 for a Context that computes energies alone."""
+    value = number(size, name, unit.picosecond)
+    if not (math.isfinite(value) and value >= 0):
+        raise error(f"the nominal step size must be positive and finite, or 0 to take no steps, not {value:g} ps")
     return value
 
 
