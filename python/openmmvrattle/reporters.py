@@ -29,13 +29,13 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import IO, Any
 
-import numpy as np
 import openmm
 from openmm import app, unit
 
-import openmmvrattle
-
+from ._constraint_errors import ConstraintErrors, expressions_of
+from .custom import CustomVariableStepRattleIntegrator
 from .custom.settings import MONITOR_KINDS
+from .serialization import with_class
 
 __all__ = ["StepSizeReporter", "run_for_time"]
 
@@ -45,8 +45,9 @@ class StepSizeReporter:
 
     The columns are, as far as the integrator has them: step, time, size and density of the last step, the value of each
     monitor, energy minus the energy at the start, iterations of the constraint solver per step since the last report,
-    rescues and force evaluations so far, and the largest relative error of a constrained distance. An integrator of
-    OpenMM has the step size alone of what is about steps, so the two can be compared.
+    rescues and force evaluations so far, and the largest relative error of a constraint, in the sense of
+    setConstraintTolerance(). With automatic step control the monitors are U_A and U_B of docs/automatic.md. An
+    integrator of OpenMM has the step size alone of what is about steps, so the two can be compared.
 
     A report does not disturb the run, and costs no force evaluation of the integrator. For its energy it asks OpenMM
     for the potential energy, as ``StateDataReporter`` does; two reporters that report at the same step share it, and
@@ -85,7 +86,8 @@ class StepSizeReporter:
             solverIterations: whether to report the iterations of the constraint solver per step.
             rescues: whether to report the number of rescued steps.
             forceEvaluations: whether to report the number of force evaluations.
-            constraintError: whether to report the largest relative error of a constrained distance.
+            constraintError: whether to report the largest relative error of a constraint: of a distance, or of an
+                expression of up to 100 particles.
             separator: what stands between two columns.
             append: whether to add to an existing file, without a line of headings.
         """
@@ -118,7 +120,7 @@ class StepSizeReporter:
         self._headings: list[str] = []
         self._energy_at_start: float | None = None
         self._last_count: tuple[int, int] | None = None
-        self._constraints: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._constraint_errors: ConstraintErrors | None = None
 
     def describeNextReport(self, simulation: app.Simulation) -> dict[str, Any]:
         """Get information about the next report.
@@ -189,7 +191,7 @@ class StepSizeReporter:
         row["Rescues"] = _called(integrator, "getNumRescues")
         row["Force Evaluations"] = _called(integrator, "getNumForceEvaluations")
         if self._wanted["Constraint Error"]:
-            row["Constraint Error"] = self._constraint_error(simulation.system, state)
+            row["Constraint Error"] = self._constraint_error(simulation.system, integrator, state)
         return {
             heading: value for heading, value in row.items() if value is not None and self._wanted.get(heading, True)
         }
@@ -203,17 +205,11 @@ class StepSizeReporter:
         self._last_count = (step, iterations)
         return (iterations - last_iterations) / (step - last_step) if step > last_step else math.nan
 
-    def _constraint_error(self, system: openmm.System, state: openmm.State) -> float:
-        if self._constraints is None:
-            found = [system.getConstraintParameters(i) for i in range(system.getNumConstraints())]
-            first, second = (np.array([constraint[k] for constraint in found], dtype=int) for k in (0, 1))
-            self._constraints = (first, second, np.array([_plain(c[2], unit.nanometer) for c in found]))
-        first, second, distances = self._constraints
-        if not len(distances):
-            return 0.0
-        positions = _plain(state.getPositions(asNumpy=True), unit.nanometer)
-        lengths = np.linalg.norm(positions[first] - positions[second], axis=1)
-        return float(np.max(np.abs(lengths / distances - 1.0)))
+    def _constraint_error(self, system: openmm.System, integrator: Any, state: openmm.State) -> float:
+        if self._constraint_errors is None:
+            self._constraint_errors = ConstraintErrors(system)
+        self._constraint_errors.update(expressions_of(integrator))
+        return self._constraint_errors.largest(_plain(state.getPositions(asNumpy=True), unit.nanometer))
 
     def to_dataframe(self) -> Any:
         """Get the reports so far as a pandas DataFrame, from memory or from the file.
@@ -247,7 +243,7 @@ def run_for_time(
     The time is met exactly at each report, and the last report is at the end. The report intervals of the reporters,
     which are numbers of steps, are not used. With an integrator that chooses its steps this shortens the step before
     each report (see ``stepTo``), so let many steps lie between two reports. With fixed steps the times must be
-    multiples of the step.
+    multiples of the step. Of a CompoundIntegrator it is the integrator chosen at the time that counts.
 
     The files of ``DCDReporter`` and ``XTCReporter`` get the times of the reports, if they were begun here.
 
@@ -262,20 +258,27 @@ def run_for_time(
     start = _plain(context.getTime(), unit.picosecond)
     # A last interval that is short by nothing but rounding is a whole one.
     count = max(1, math.ceil(length / interval * (1.0 - 1e-9)))
-    advance = _advance_by_time if hasattr(simulation.integrator, "stepTo") else _advance_by_steps
-    if advance is _advance_by_steps:
+    integrator = _integrator_of(simulation)
+    if not hasattr(integrator, "stepTo"):
         for time in {interval, length - (count - 1) * interval}:
-            _whole_steps(simulation, time)
+            _whole_steps(integrator, time)
     for number in range(1, count + 1):
         # Not a sum of intervals, so that roundings do not add up.
         # As in Simulation.step, reporters say what they need before the steps.
         wishes = [(reporter, *_wish(reporter.describeNextReport(simulation))) for reporter in simulation.reporters]
-        advance(simulation, start + length if number == count else start + number * interval)
+        _advance(simulation, start + length if number == count else start + number * interval)
         _report(simulation, interval, wishes)
 
 
-def _advance_by_time(simulation: app.Simulation, time: float) -> None:
-    integrator, context = simulation.integrator, simulation.context
+def _advance(simulation: app.Simulation, time: float) -> None:
+    integrator = _integrator_of(simulation)  # a reporter may have chosen another one
+    if hasattr(integrator, "stepTo"):
+        _advance_by_time(integrator, simulation.context, time)
+    else:
+        _advance_by_steps(integrator, simulation.context, time)
+
+
+def _advance_by_time(integrator: Any, context: openmm.Context, time: float) -> None:
     largest = _called(integrator, "getMaximumStepSize")
     if largest:
         # A few steps at a time as far as they cannot lead beyond, to give Python a chance to respond to Ctrl-C.
@@ -284,26 +287,25 @@ def _advance_by_time(simulation: app.Simulation, time: float) -> None:
     integrator.stepTo(time)
 
 
-def _advance_by_steps(simulation: app.Simulation, time: float) -> None:
-    context = simulation.context
+def _advance_by_steps(integrator: Any, context: openmm.Context, time: float) -> None:
     now = _plain(context.getTime(), unit.picosecond)
-    steps = _whole_steps(simulation, time - now)
+    steps = _whole_steps(integrator, time - now)
     while steps > 0:
-        simulation.integrator.step(min(10, steps))
+        integrator.step(min(10, steps))
         steps -= 10
     reached = _plain(context.getTime(), unit.picosecond)
     if abs(reached - time) > 1e-6 * (time - now):
-        name = type(simulation.integrator).__name__
+        name = type(integrator).__name__
         raise ValueError(f"{name} has no stepTo and does not take fixed steps, so it cannot be run until a given time.")
 
 
-def _whole_steps(simulation: app.Simulation, time: float) -> int:
+def _whole_steps(integrator: Any, time: float) -> int:
     """The number of fixed steps in a time."""
-    size = _plain(simulation.integrator.getStepSize(), unit.picosecond)
+    size = _plain(integrator.getStepSize(), unit.picosecond)
     steps = round(time / size) if size > 0.0 else 0
     if steps < 1 or abs(steps * size - time) > 1e-6 * size * max(1, steps):
         raise ValueError(
-            f"{time:g} ps is not a multiple of the step of {size:g} ps of {type(simulation.integrator).__name__}: "
+            f"{time:g} ps is not a multiple of the step of {size:g} ps of {type(integrator).__name__}: "
             "choose the duration and the time between reports as multiples of the step."
         )
     return steps
@@ -368,17 +370,20 @@ class _WithStepSize:
 def _integrator_of(simulation: app.Simulation) -> Any:
     """The integrator that takes the steps: of a CompoundIntegrator the one that is chosen."""
     integrator = simulation.integrator
-    if isinstance(integrator, openmm.CompoundIntegrator):
-        integrator = integrator.getIntegrator(integrator.getCurrentIntegrator())
-        for name in ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator"):
-            if name in openmmvrattle.__all__ and getattr(openmmvrattle, name).isinstance(integrator):
-                integrator = getattr(openmmvrattle, name).cast(integrator)
-    return integrator
+    if not isinstance(integrator, openmm.CompoundIntegrator):
+        return integrator
+    member = with_class(integrator.getIntegrator(integrator.getCurrentIntegrator()))
+    if isinstance(member, CustomVariableStepRattleIntegrator):
+        member.attachContext(simulation.context)
+    return member
 
 
 def _monitor_values(integrator: Any) -> dict[str, float | None]:
     if not hasattr(integrator, "getMonitorValue"):
         return {}
+    if hasattr(integrator, "isAutomatic") and integrator.isAutomatic():
+        # Its two monitors are its own.
+        return {f"Monitor {name}": float(integrator.getMonitorValue(k)) for k, name in enumerate(("U_A", "U_B"))}
     values: dict[str, float | None] = {}
     for index in range(integrator.getNumMonitors()):
         kind = integrator.getMonitor(index)[0]

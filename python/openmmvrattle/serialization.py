@@ -22,15 +22,16 @@ class XmlSerializer(openmm.XmlSerializer):
     @staticmethod
     def deserialize(inputString: str) -> object:
         """Reconstruct an object that has been serialized as XML."""
-        return _with_class(openmm.XmlSerializer.deserialize(inputString))
+        return with_class(openmm.XmlSerializer.deserialize(inputString))
 
     @staticmethod
     def clone(object: object) -> object:
         """Clone an object by serializing and deserializing it, without the detour of an XML text."""
-        return _with_class(openmm.XmlSerializer.clone(object))
+        return with_class(openmm.XmlSerializer.clone(object))
 
 
-def _with_class(result: object) -> object:
+def with_class(result: object) -> object:
+    """What OpenMM has returned, of our own class if it is one of our integrators."""
     # The compiled class exists only where it could be loaded.
     compiled = sys.modules.get(f"{__package__}.vrattle")
     classes = [CustomVariableStepRattleIntegrator] + ([compiled.VariableStepRattleIntegrator] if compiled else [])

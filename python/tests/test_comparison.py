@@ -17,8 +17,8 @@ import numpy as np
 import openmm
 import pytest
 from openmmvrattle import __main__ as command_line
-from openmmvrattle import measurement as measurement_module
-from openmmvrattle import plots
+from openmmvrattle.compare import measurement as measurement_module
+from openmmvrattle.compare import plots
 from openmmvrattle.compare.commands.compare import print_comparison
 from openmmvrattle.compare.comparison import (
     Comparison,

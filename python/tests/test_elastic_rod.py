@@ -16,8 +16,9 @@ import pytest
 from dense_reference import EXPLICIT, SEMI_EXPLICIT, Control, DenseStepper, value
 from dense_rod import Rod, gradient_of
 from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle._constraint_errors import ConstraintErrors
 from openmmvrattle.compare.comparison import compare
-from openmmvrattle.testsystems import ExpressionConstraint, TestSystem, elastic_rod
+from openmmvrattle.testsystems import ExpressionConstraint, TestSystem, constraint_error, elastic_rod
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "rod_reference.json").read_text(encoding="utf-8"))
 TIMES = ("0.1", "0.3")
@@ -137,6 +138,21 @@ def test_constraints_and_their_derivatives() -> None:
     v = dense.start_velocity
     second = constraints_of(rod, v) - 2 * constraints_of(rod, np.zeros_like(v)) + constraints_of(rod, -v)
     np.testing.assert_allclose(second, dense.second(np.zeros_like(v), v), atol=1e-13)
+
+
+def test_constraint_error_that_comparisons_measure() -> None:
+    """Of the expressions |g| over the norm of its gradient and 0.1 nm, from the dense statement."""
+    rod, dense = elastic_rod(), Rod()
+    errors = ConstraintErrors(
+        rod.system, [(c.expression, c.particles, dict(c.parameters)) for c in rod.expression_constraints]
+    )
+    assert errors.largest(rod.positions) < 1e-14
+    for q in states()[1:]:
+        expressions = dense.g(q)[27:]
+        gradients = dense.jacobian(q)[27:, 9:]  # the first section has no mass
+        expected = np.max(np.abs(expressions) / np.linalg.norm(gradients, axis=1)) / 0.1
+        distances = constraint_error(rod.system, q.reshape(-1, 3))
+        assert errors.largest(q.reshape(-1, 3)) == pytest.approx(max(expected, distances), rel=1e-10)
 
 
 def test_start_meets_constraints_that_are_independent() -> None:

@@ -413,9 +413,99 @@ def test_times_that_cannot_be(arguments: tuple[float, ...], words: str) -> None:
     assert simulation.currentStep == 0
 
 
+class OtherSteps(openmm.VerletIntegrator):
+    """Steps are not what it says that they are."""
+
+    def getStepSize(self) -> unit.Quantity:
+        return 0.5 * super().getStepSize()
+
+
 def test_variable_steps_without_stepTo_are_refused() -> None:
-    compound = openmm.CompoundIntegrator()
-    compound.addIntegrator(our_integrator())
-    simulation = make_simulation(compound)
-    with pytest.raises(ValueError, match="no stepTo"):
+    simulation = make_simulation(OtherSteps(0.001))
+    with pytest.raises(ValueError, match="OtherSteps has no stepTo and does not take fixed steps"):
         run_for_time(simulation, 0.01)
+
+
+@pytest.mark.parametrize(
+    "kind, automatic",
+    [
+        (VariableStepRattleIntegrator, False),
+        (VariableStepRattleIntegrator, True),
+        (CustomVariableStepRattleIntegrator, False),
+    ],
+)
+def test_a_compound_integrator_is_run_for_a_time(kind: type, automatic: bool) -> None:
+    """Equilibration with one integrator and the run with ours, as one Simulation, with reports at equal times."""
+    test, ours = rigid_waters(4), kind(0.001, monitors=[kind.ConstraintAndAppliedForce])
+    if automatic:
+        ours.useAutomaticStepControl(20)
+    thermostat = openmm.LangevinMiddleIntegrator(300, 1, 0.001)
+    thermostat.setRandomNumberSeed(1)
+    compound = openmm.CompoundIntegrator()
+    for member in (thermostat, ours):
+        compound.addIntegrator(member)
+    simulation = make_simulation(compound, test.system)
+    table = io.StringIO()
+    simulation.reporters.append(app.StateDataReporter(table, 1, step=True, time=True, totalEnergy=True))
+    simulation.reporters.append(reporter := StepSizeReporter(None, 1))
+    run_for_time(simulation, 0.02, every=0.01)
+    compound.setCurrentIntegrator(1)
+    run_for_time(simulation, 0.02, every=0.01)
+    times = [row["Time (ps)"] for row in read(table.getvalue())]
+    assert times == pytest.approx([0.01, 0.02, 0.03, 0.04], rel=1e-12)
+    assert times[2:] == [times[1] + 0.01, times[1] + 0.02]
+    assert time_of(simulation) == times[-1]
+    assert "Step Density" not in reporter.rows[1] and reporter.rows[3]["Step Density"] != 1
+    monitors = [name for name in reporter.rows[3] if name.startswith("Monitor")]
+    assert monitors == (["Monitor U_A", "Monitor U_B"] if automatic else ["Monitor ConstraintAndAppliedForce"])
+    assert simulation.currentStep > 35
+
+
+def test_monitors_of_automatic_step_control() -> None:
+    integrator = VariableStepRattleIntegrator(0.001, automatic=True)
+    simulation = make_simulation(integrator)
+    reporter = StepSizeReporter(None, 5)
+    simulation.reporters.append(reporter)
+    simulation.step(10)
+    for k, name in enumerate(("Monitor U_A", "Monitor U_B")):
+        assert reporter.rows[-1][name] == integrator.getMonitorValue(k) > 0
+        assert reporter.rows[-1][name] != reporter.rows[0][name]
+
+
+def test_the_constraint_error_is_that_of_expressions_too() -> None:
+    """Against formulas: a ring of a fixed radius, a plane through a point, and a distance of the System."""
+    system = openmm.System()
+    for mass in (1.0, 2.0, 0.0):
+        system.addParticle(mass)
+    system.addConstraint(0, 1, 0.2)
+    integrator = VariableStepRattleIntegrator(0.001, monitors=[])
+    integrator.addConstraint("k*(x1^2 + y1^2 - r^2)", [0], {"r": 0.5, "k": 1e3})
+    integrator.addConstraint("(z1 - z2)/0.01", [1, 2])
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in range(3):
+        topology.addAtom("X", None, residue)
+    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatform("Reference"))
+    exact = np.array([[0.5, 0.0, 0.0], [0.7, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    simulation.context.setPositions(exact)
+
+    def reported(positions: np.ndarray) -> float:
+        reporter = StepSizeReporter(None, 1, energyError=False, monitors=False)
+        simulation.context.setPositions(positions)
+        reporter.report(simulation, simulation.context.getState(positions=True))
+        return reporter.rows[0]["Constraint Error"]
+
+    def moved(particle: int, axis: int, by: float) -> np.ndarray:
+        positions = exact.copy()
+        positions[particle, axis] += by
+        return positions
+
+    assert reported(exact) < 1e-15
+    # |g|/|grad g| over 0.1 nm: the gradient of the circle is 2 k r, that of the plane 1/0.01 (particle 2 is fixed).
+    both = exact + [[0.0, 0.01, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.0]]
+    assert reported(both) == pytest.approx(0.01**2 / (2 * math.hypot(0.5, 0.01)) / 0.1, rel=1e-9)
+    assert reported(moved(1, 2, 0.003)) == pytest.approx(0.03, rel=1e-9)
+    assert reported(moved(1, 0, 0.004)) == pytest.approx(0.02, rel=1e-9)  # the distance
+    # With another value of a parameter.
+    integrator.setExpressionConstraintParameter(0, "r", 0.4)
+    assert reported(exact) == pytest.approx((0.25 - 0.16) / (2 * 0.5) / 0.1, rel=1e-9)

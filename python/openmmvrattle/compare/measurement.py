@@ -20,7 +20,8 @@ from openmm import unit
 
 from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
 
-from ..testsystems import ComparisonSettings, StepControl, TestSystem, constraint_error
+from .._constraint_errors import ConstraintErrors
+from ..testsystems import ComparisonSettings, StepControl, TestSystem
 
 __all__ = [
     "DEFAULT_INTEGRATORS",
@@ -88,7 +89,7 @@ class IntegratorRun:
     largest_step: float
     """ps, of all steps"""
     largest_constraint_error: float
-    """Relative error of a constrained distance, from at most 2000 points along the run."""
+    """Relative error of a constraint, a distance or an expression, from at most 2000 points along the run."""
     seconds_per_step: float
     """Wall time of step(1), without the measurements between the steps."""
     energy_samples: int
@@ -461,6 +462,10 @@ def _measure(
     energy_interval = math.ceil(evaluations / MAXIMUM_ENERGY_SAMPLES)
     constraint_interval = math.ceil(evaluations / MAXIMUM_CONSTRAINT_SAMPLES)
     end, limit = _end_of(settings), most_steps or 2 * evaluations
+    constraint_errors = ConstraintErrors(
+        test_system.system,
+        [(c.expression, c.particles, dict(c.parameters)) for c in test_system.expression_constraints],
+    )
     energy_at_start = _energy(test_system, context)
     times, errors, sizes = [0.0], [0.0], [math.nan]
     simulated, steps, seconds, largest_constraint_error = 0.0, 0, 0.0, 0.0
@@ -480,7 +485,8 @@ def _measure(
                 errors.append(_checked_energy(test_system, context, simulated) - energy_at_start)
                 sizes.append(size)
             if steps % constraint_interval == 0 or last:
-                largest_constraint_error = max(largest_constraint_error, _constraint_error(test_system, context))
+                positions = context.getState(getPositions=True).getPositions(asNumpy=True)._value
+                largest_constraint_error = max(largest_constraint_error, constraint_errors.largest(positions))
                 if largest_constraint_error >= 1.0:
                     raise _RunError(f"at {simulated:.4g} ps it had lost its constraints")
                 report("running", simulated / settings.total_time)
@@ -607,11 +613,6 @@ def _energy(test_system: TestSystem, context: openmm.Context) -> float:
     """Kinetic plus potential energy at the time of the positions, in kJ/mol."""
     state = context.getState(getEnergy=True, groups=test_system.force_groups)
     return state.getKineticEnergy()._value + state.getPotentialEnergy()._value
-
-
-def _constraint_error(test_system: TestSystem, context: openmm.Context) -> float:
-    positions = context.getState(getPositions=True).getPositions(asNumpy=True)._value
-    return constraint_error(test_system.system, positions)
 
 
 def initial_energy(test_system: TestSystem, platform: str) -> float:

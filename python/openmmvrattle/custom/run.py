@@ -9,8 +9,8 @@ import weakref
 
 import numpy as np
 import openmm
-from openmm import unit
 
+from .._constraint_errors import DistanceConstraints
 from .settings import INSTEAD, Settings, error
 
 LOST = 1e-3
@@ -33,10 +33,7 @@ class Run:
         """Whether the default monitor is that of the applied force too."""
         self.good: bytes | None = None
         """A checkpoint of the last state that was looked at, since the start of the present sequence of densities."""
-        constraints = [system.getConstraintParameters(i) for i in range(system.getNumConstraints())]
-        self._first = np.array([c[0] for c in constraints], dtype=int)
-        self._second = np.array([c[1] for c in constraints], dtype=int)
-        self._distances = np.array([c[2].value_in_unit(unit.nanometer) for c in constraints])
+        self._constraints = DistanceConstraints(system)
         # Small systems are looked at often, and large ones so that it costs next to nothing.
         self._interval = int(np.clip(system.getNumParticles() / 20, 10, 500))
         self._until_check = 1
@@ -89,7 +86,7 @@ class Run:
             return [], None
         self._until_check = self._interval
         message = None
-        if len(self._distances):
+        if len(self._constraints):
             x = positions_of(self.context)
             message, failure = self._check_constraints(x, tolerance)
             if failure is not None:
@@ -100,16 +97,16 @@ class Run:
 
     def _check_constraints(self, x: np.ndarray, tolerance: float) -> tuple[str | None, str | None]:
         """What to warn of, and why the run cannot go on."""
-        errors = np.abs(np.linalg.norm(x[self._first] - x[self._second], axis=1) / self._distances - 1)
+        errors = self._constraints.errors(x)
         worst = int(np.argmax(errors))
         largest = float(errors[worst])
         # OpenMM's SETTLE has its distances in single precision only, whatever the tolerance.
         rounding = 1e-6
         if self.precision == "single":
-            rounding += 1e-6 * float(np.max(np.abs(x)) / self._distances[worst])
+            rounding += 1e-6 * float(np.max(np.abs(x)) / self._constraints.distances[worst])
         if largest < 10 * max(tolerance, rounding) or largest < 10 * self._largest_error:
             return None, None
-        pair = f"particles {self._first[worst]} and {self._second[worst]}"
+        pair = f"particles {self._constraints.first[worst]} and {self._constraints.second[worst]}"
         if not largest <= LOST:
             advice = redundant_constraints(self.context.getSystem(), x) or (
                 f"use {INSTEAD} and solves strongly coupled constraints directly, or take a smaller nominal step size"

@@ -12,6 +12,8 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
+from .._constraint_errors import ConstraintErrors, DistanceConstraints
+
 
 @dataclass(frozen=True)
 class MonitorSettings:
@@ -179,11 +181,7 @@ def constraint_error(system: openmm.System, positions: np.ndarray) -> float:
         system: the system whose constraints are checked.
         positions: positions in nm, one row for each particle.
     """
-    first, second, distances = _constraint_arrays(system)
-    if not len(distances):
-        return 0.0
-    lengths = np.linalg.norm(positions[first] - positions[second], axis=1)
-    return float(np.max(np.abs(lengths / distances - 1.0)))
+    return ConstraintErrors(system).largest(positions)
 
 
 def project_onto_constraints(
@@ -202,7 +200,8 @@ def project_onto_constraints(
     Returns:
         The projected positions and velocities.
     """
-    first, second, distances = _constraint_arrays(system)
+    constraints = DistanceConstraints(system)
+    first, second, distances = constraints.first, constraints.second, constraints.distances
     positions, velocities = np.array(positions, dtype=float), np.array(velocities, dtype=float)
     if not len(distances):
         return positions, velocities
@@ -232,15 +231,6 @@ def project_onto_constraints(
     matrix = jacobian()
     velocities -= correction(matrix, np.einsum("kia,ia->k", matrix, velocities))
     return positions, velocities
-
-
-def _constraint_arrays(system: openmm.System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The two particles and the distance (nm) of each constraint."""
-    constraints = [system.getConstraintParameters(i) for i in range(system.getNumConstraints())]
-    first = np.array([c[0] for c in constraints], dtype=int)
-    second = np.array([c[1] for c in constraints], dtype=int)
-    distances = np.array([c[2].value_in_unit(unit.nanometer) for c in constraints])
-    return first, second, distances
 
 
 def equilibrated(
