@@ -905,7 +905,7 @@ def setExpressionConstraintParameter(self, index: int, name: str, value: float |
     name : str
         the name of the parameter
     value : float or Quantity
-        its new value
+        its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
     """
     self.setExpressionParameterValue(index, name, value)
 %}
