@@ -3,11 +3,10 @@
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "ExpressionCheck.h"
+#include "SystemCheck.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
 #include "openmm/internal/ContextImpl.h"
-#include "openmm/internal/ForceImpl.h"
-#include "openmm/reference/ReferencePlatform.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/XmlSerializer.h"
 #include "openmmvrattle/VRattleKernels.h"
@@ -73,18 +72,6 @@ void checkOpenMMVersion() {
         throw OpenMMException("VariableStepRattleIntegrator: this plugin was built for OpenMM " + built +
                               " and cannot run with OpenMM " + running + "; install openmm==" + built +
                               ".* or rebuild the plugin");
-}
-
-// A Drude particle moved like any other would take up heat from the rest. The class DrudeForce is in a library of its
-// own, which we do not link with, so it is recognised by its kernel.
-void refuseDrudeParticles(ContextImpl& context) {
-    for (OpenMM::ForceImpl* force : context.getForceImpls()) {
-        const vector<string> names = force->getKernelNames();
-        if (std::find(names.begin(), names.end(), "CalcDrudeForce") != names.end())
-            throw OpenMMException("VariableStepRattleIntegrator: the System has a DrudeForce and Drude particles need "
-                                  "an integrator made for them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
-                                  "DrudeLangevinIntegrator, or a force field without Drude particles");
-    }
 }
 
 // Whether a System has a constraint that could move anything, of its own or by expression.
@@ -424,34 +411,6 @@ double VariableStepRattleIntegrator::getExpressionConstraintMultiplier(int index
     return getMultipliers().at(numDistances + index);
 }
 
-// What can be known of the constraints without positions.
-void VariableStepRattleIntegrator::checkExpressionConstraints(const ContextImpl& contextRef) const {
-    if (settings->expressions.empty())
-        return;
-    const Platform& platform = const_cast<ContextImpl&>(contextRef).getPlatform();
-    if (dynamic_cast<const OpenMM::ReferencePlatform*>(&platform) == NULL)
-        throw OpenMMException("VariableStepRattleIntegrator: constraints given as expressions work on the platforms "
-                              "Reference and CPU, and this Context is on " +
-                              platform.getName() + "; create it on one of those");
-    const OpenMM::System& system = contextRef.getSystem();
-    for (int i = 0; i < getNumExpressionConstraints(); i++) {
-        const string constraint = "VariableStepRattleIntegrator: expression constraint " + std::to_string(i) + " (" +
-                                  settings->expressions[i].expression + ") ";
-        bool canMove = false;
-        for (int particle : settings->expressions[i].particles) {
-            if (particle >= system.getNumParticles())
-                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
-                                      ", and the System has " + std::to_string(system.getNumParticles()));
-            if (system.isVirtualSite(particle))
-                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
-                                      ", which is a virtual site; write it with the particles that define the site");
-            canMove |= system.getParticleMass(particle) > 0;
-        }
-        if (!canMove)
-            throw OpenMMException(constraint + "has no particle with mass, and so nothing that it could move");
-    }
-}
-
 // ----------------------------------------------------------------------------------------------------------- the run
 
 IntegratorRun& VariableStepRattleIntegrator::requireRun() const {
@@ -479,8 +438,7 @@ void VariableStepRattleIntegrator::initialize(ContextImpl& contextRef) {
     checkOpenMMVersion();
     if (owner != NULL && &contextRef.getOwner() != owner)
         throw OpenMMException("This Integrator is already bound to a context");
-    refuseDrudeParticles(contextRef);
-    checkExpressionConstraints(contextRef);
+    requireSuitableSystem(contextRef, settings->expressions);
     const OpenMM::System& system = contextRef.getSystem();
     settings->fitDefaultMonitor(hasConstraints(system, *settings));
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);

@@ -429,7 +429,6 @@ private:
     void checkConstraint(const std::string& expression, const std::vector<int>& particles,
                          const std::map<std::string, double>& parameters);
     void checkExpressionConstraintIndex(int index) const;
-    void checkExpressionConstraints(const OpenMM::ContextImpl& context) const;
     void checkMonitorIndex(int index) const;
     void checkReferenceIndex(int index) const;
     IntegratorRun& requireRun() const;

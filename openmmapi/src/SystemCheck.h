@@ -1,0 +1,23 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_SYSTEMCHECK_H_
+#define OPENMMVRATTLE_SYSTEMCHECK_H_
+
+#include "expressions/ExpressionGroup.h"
+#include "openmm/internal/ContextImpl.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * Refuse what can be known to go wrong before there are positions: masses that are no masses, constraints on virtual sites, Forces
+ * that need an integrator of their own, and Forces that would give a wrong ensemble since they know the System's constraints alone.
+ *
+ * @throws OpenMMException    which names what it is and the way out
+ */
+void requireSuitableSystem(OpenMM::ContextImpl& context, const std::vector<ExpressionConstraint>& expressions);
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_SYSTEMCHECK_H_
