@@ -104,6 +104,7 @@ RELEASES_GIL(getExpressionConstraintMultiplier)
 RELEASES_GIL(getMonitorValue)
 RELEASES_GIL(getMultipliers)
 RELEASES_GIL(reverse)
+RELEASES_GIL(setVelocitiesToTemperature)
 RELEASES_GIL(step)
 RELEASES_GIL(stepTo)
 
@@ -771,6 +772,35 @@ def calibrate(self, steps: int) -> None:
     $action(self, _integer(steps, "steps"))
 %}
 
+%feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::setVelocitiesToTemperature %{
+def setVelocitiesToTemperature(self, temperature: float | unit.Quantity, randomSeed: int | None = None) -> None:
+    r"""
+    Give the particles of the Context random velocities of a temperature that satisfy all constraints, those given as
+    expressions too: each is drawn from Maxwell's distribution, and all together are projected onto the constraints in the
+    metric of the masses, so that the mean kinetic energy is kT/2 for each degree of freedom that the constraints leave. It
+    does what setVelocitiesToTemperature() of the Context does, whose solver leaves expressions alone and can fail where
+    constraints are strongly coupled.
+
+    Where the positions do not satisfy the constraints, the velocities satisfy them at the positions that the next step
+    starts from. The forces are computed once, for that step.
+
+    Parameters
+    ----------
+    temperature : float or Quantity
+        the temperature (in K); not negative
+    randomSeed : int
+        the same seed gives the same velocities. Default: another one at each call
+
+    Raises
+    ------
+    OpenMMException
+        if the temperature is negative or not finite, there is no Context, or its positions are no start for a run; the
+        velocities are then as before
+    """
+    seed = () if randomSeed is None else (_integer(randomSeed, "randomSeed"),)
+    $action(self, _number(temperature, "temperature", unit.kelvin), *seed)
+%}
+
 %feature("shadow") OpenMMVRattle::VariableStepRattleIntegrator::getStepDensity %{
 def getStepDensity(self) -> float:
     r"""
@@ -1081,6 +1111,7 @@ public:
     double getReferenceMonitorValue(int index = 0) const;
     void setReferenceMonitorValue(double value, int index = 0);
     void calibrate(int steps);
+    void setVelocitiesToTemperature(double temperature, int randomSeed = osrngseed());
     double getStepDensity() const;
     double getMonitorValue(int index = 0) const;
     std::vector<double> getMultipliers() const;

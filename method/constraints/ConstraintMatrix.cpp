@@ -198,7 +198,7 @@ void ConstraintMatrix::throwDependent(int constraint, const ConstraintSystem::Ja
         if (!explanation.empty())
             throw StepFailure(explanation);
     }
-    throw DependentConstraints(system.getClusterParticles((int) c));
+    throw DependentConstraints(system.getClusterParticles((int) c), system.explainLine((int) c));
 }
 
 void ConstraintMatrix::solve(vector<double>& x, const ConstraintSystem::Part& part) const {

@@ -4,6 +4,7 @@
 #include "constraints/ConstraintSystem.h"
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <set>
 
 using namespace OpenMMVRattle;
@@ -15,6 +16,8 @@ namespace {
 // A motion that changes the gradient of an expression by this fraction of its size is too long for an iteration, and that is a
 // matter of singular geometry if it is shorter than the second fraction of the distances between the particles.
 const double STRONG_CURVATURE = 0.25, SHARPNESS = 0.1;
+// Lengths of a molecule in a line add up but for this fraction, which files may round them by.
+const double LINE_ROUNDING = 1e-6;
 
 std::string listParticles(const vector<int>& particles) {
     const size_t maxListed = 12;
@@ -42,8 +45,14 @@ std::string ConstraintSystem::describe(int index) const {
 }
 
 std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobian) const {
-    if (!isExpression(index))
-        return "";
+    if (!isExpression(index)) {
+        const DistanceConstraint& c = constraints[index];
+        return jacobian[index].dot(jacobian[index]) > 0
+                   ? ""
+                   : "the particles " + std::to_string(c.particle1) + " and " + std::to_string(c.particle2) +
+                         " are at the same position, so that the distance at which a constraint holds them has no "
+                         "direction; set other positions";
+    }
     const ExpressionRow& row = findRow(index);
     double square = 0;
     for (int entry = row.first; entry < row.end; entry++)
@@ -56,6 +65,29 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
                   "gradient does not vanish where it holds"
                 : " is not finite at these positions; choose others, or write it such that it has a derivative "
                   "where it holds");
+}
+
+std::string ConstraintSystem::explainLine(int cluster) const {
+    std::map<int, std::map<int, double>> lengths; // from each particle to others
+    const int first = clusters[cluster].first, end = first + clusters[cluster].size;
+    for (int k = first; k < end; k++)
+        if (!isExpression(k)) {
+            const DistanceConstraint& c = constraints[k];
+            lengths[c.particle1][c.particle2] = lengths[c.particle2][c.particle1] = c.length;
+        }
+    for (const auto& [one, toOthers] : lengths)
+        for (const auto& [other, whole] : toOthers)
+            for (const auto& [middle, part] : toOthers) {
+                const auto rest = lengths[other].find(middle);
+                if (rest == lengths[other].end() || !(std::fabs(part + rest->second - whole) <= LINE_ROUNDING * whole))
+                    continue;
+                return "the distances among the particles " + std::to_string(one) + ", " + std::to_string(middle) +
+                       " and " + std::to_string(other) +
+                       " keep them in a line, where they depend on each other: hold the middle one there by three "
+                       "expressions in place of its distances, such as x2 - 0.5*(x1+x3), likewise y and z "
+                       "(docs/constraints.md, molecules in a line)";
+            }
+    return "";
 }
 
 vector<int> ConstraintSystem::getClusterParticles(int cluster) const {
@@ -73,7 +105,6 @@ vector<int> ConstraintSystem::getClusterParticles(int cluster) const {
     return vector<int>(particles.begin(), particles.end());
 }
 
-// How far the particles are from where an expression holds, to first order, in units of EXPRESSION_LENGTH.
 double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<double>& g, const Jacobian& nearby) const {
     double square = 0;
     for (int entry = row.first; entry < row.end; entry++)

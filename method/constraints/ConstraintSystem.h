@@ -145,6 +145,10 @@ public:
     const DistanceConstraint& getConstraint(int index) const {
         return constraints[index];
     }
+    /** A constraint that is given as an expression, with its parameters. */
+    const ExpressionConstraint& getExpression(int index) const {
+        return expressions[givenIndex[index] - numGivenDistances];
+    }
     const std::vector<ExpressionRow>& getExpressionRows() const {
         return expressionRows;
     }
@@ -215,6 +219,8 @@ public:
      */
     double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, const Jacobian& nearby,
                     const Part& part = ALL) const;
+    /** How far the particles are from where an expression holds, to first order, in units of EXPRESSION_LENGTH. */
+    double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     /** The index of the constraint with the largest relative error. */
     int findLargest(const std::vector<double>& g, const Jacobian& nearby) const;
     /**
@@ -263,6 +269,8 @@ public:
     void getGivenMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
     /** Say in words what is wrong with a constraint whose gradient is zero or not finite; empty if neither is so. */
     std::string explainGradient(int index, const Jacobian& jacobian) const;
+    /** Say in words, and with the way out, that all distances of three particles in a line are among a cluster's; else empty. */
+    std::string explainLine(int cluster) const;
 
 private:
     /** A stretch of distance constraints in the internal order: first, ..., end - 1. */
@@ -321,7 +329,6 @@ private:
     template <class Task> void forGroups(const Part& part, const Task& task) const;
     const ExpressionRow& findRow(int constraint) const;
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
-    double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
     std::vector<double> masses, inverseMasses;
     std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning

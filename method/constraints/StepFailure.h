@@ -21,7 +21,12 @@ public:
 /** The constraints among some particles depend on each other, so that their multipliers are not defined. */
 class DependentConstraints : public StepFailure {
 public:
-    explicit DependentConstraints(const std::vector<int>& particles) : StepFailure(describe(particles)) {
+    /**
+     * @param particles      those of the cluster
+     * @param explanation    what more is known, with the way out; may be empty
+     */
+    DependentConstraints(const std::vector<int>& particles, const std::string& explanation) :
+            StepFailure(describe(particles) + (explanation.empty() ? "" : "; " + explanation)) {
     }
 
 private:

@@ -213,6 +213,11 @@ void IntegratorRun::reverse() {
     toldDensity.reset();
 }
 
+void IntegratorRun::projectVelocities() {
+    prepare(false);
+    device.writeVelocities();
+}
+
 // ----------------------------------------------------------------------------------------------------------- trial runs
 
 vector<double> IntegratorRun::calibrate(int steps) {

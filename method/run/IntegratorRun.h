@@ -37,6 +37,8 @@ public:
     void step(int count);
     void stepTo(double time);
     void reverse();
+    /** Move the Context's velocities onto the constraints, as a start does. */
+    void projectVelocities();
     /** The mean of each monitor over a trial run from the current state, which stays as it is. */
     std::vector<double> calibrate(int steps);
 

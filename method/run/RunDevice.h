@@ -80,15 +80,19 @@ public:
 
     /**
      * Start afresh from the Context's state: positions and velocities are moved onto the constraints, the forces computed there,
-     * and Lambda and U found. There is no density yet: the next step is the first of a sequence. References stay.
+     * and Lambda and U found. There is no density yet: the next step is the first of a sequence. References stay. Virtual sites are
+     * computed, for users may have put them anywhere.
      *
-     * @throws StepFailure    if that is not possible
+     * @throws StepFailure    if that is not possible, or if requireSoundStart() (StartCheck.h) finds something
      */
     virtual void start() = 0;
     /** Go on from a state that a Force has changed (a barostat, say): as start(), but the density goes on, scaled with u. */
     virtual void changeState() = 0;
     /** Go on with changed velocities at the same positions, without computing forces; the density goes on, scaled with u. */
     virtual void changeVelocities() = 0;
+
+    /** Give the Context the velocities of the method's state, at whose positions they satisfy the constraints. */
+    virtual void writeVelocities() = 0;
 
     // ----------------------------------------------------------------------------------------------------- the steps
 

@@ -270,6 +270,8 @@ void testDependentConstraints() {
     vector<Vec3> line = {Vec3(9, 9, 9), Vec3(0, 0, 0), Vec3(0.1, 0.05, 0), Vec3(0.2, 0.1, 0)};
     double d = std::sqrt(0.0125);
     assertDependent({1, 12, 16, 12}, {{1, 2, d}, {2, 3, d}, {1, 3, 2 * d}}, line, "particles 1, 2 and 3");
+    assertDependent({1, 12, 16, 12}, {{1, 2, d}, {2, 3, d}, {1, 3, 2 * d}}, line,
+                    "the distances among the particles 1, 2 and 3 keep them in a line");
     // Two constraints of one pair must be added up, or they would hide each other.
     assertDependent({1, 12, 16, 12}, {{1, 2, d}, {2, 1, d}}, line, "particles 1 and 2");
     // A chain long enough for the sparse factorisation, with one bond doubled.

@@ -3,6 +3,7 @@
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "ExpressionCheck.h"
+#include "MaxwellVelocities.h"
 #include "SystemCheck.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
@@ -428,6 +429,27 @@ void VariableStepRattleIntegrator::stepTo(double time) {
     if (!std::isfinite(time))
         throw OpenMMException("VariableStepRattleIntegrator: stepTo() needs a finite time");
     here.stepTo(time);
+}
+
+void VariableStepRattleIntegrator::setVelocitiesToTemperature(double temperature, int randomSeed) {
+    IntegratorRun& inContext = requireRun();
+    if (!(temperature >= 0) || !std::isfinite(temperature)) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: the temperature must be a finite number of kelvins that is not "
+                   "negative, not "
+                << temperature;
+        throw OpenMMException(message.str());
+    }
+    vector<OpenMM::Vec3> before;
+    context->getVelocities(before);
+    context->setVelocities(drawMaxwellVelocities(context->getSystem(), temperature, randomSeed));
+    try {
+        inContext.projectVelocities();
+    }
+    catch (...) {
+        context->setVelocities(before);
+        throw;
+    }
 }
 
 void VariableStepRattleIntegrator::reverse() {

@@ -69,14 +69,16 @@ def fix_angle(
 ) -> int:
     """Fix the angle of three particles, with the second at its corner: the parameter `angle`.
 
-    The angle lies between 0 and pi and is neither, since there it has no direction in which to change. The multiplier
-    is a torque (kJ/mol/rad).
+    The angle lies between 0 and pi and is neither, since there it has no direction in which to change: three particles
+    that are to stay in a line are held by other expressions, which docs/constraints.md shows ("Molecules in a line").
+    The multiplier is a torque (kJ/mol/rad).
     """
     value = _number(angle, _ANGLE, "angle")
     if not 0 < value < math.pi:
         raise ValueError(
             f"the angle must lie between 0 and pi, and not at these, where it has no derivative: {value} does not; "
-            "three particles in a line are held by distances from a fourth"
+            "hold three particles in a line by the distance of the outer two and three expressions that put the middle "
+            "one between them, such as x2 - 0.5*(x1+x3), likewise y and z (docs/constraints.md, molecules in a line)"
         )
     return integrator.addConstraint(
         "atan2(sqrt(cx^2 + cy^2 + cz^2), ax*bx + ay*by + az*bz) - angle;"

@@ -132,7 +132,7 @@ def test_the_docstring_of_a_method_says_what_it_takes_returns_and_raises(name: s
         explanation = re.search(rf"^{parameter} : .+\n((    .*\n?)+)", documentation, re.MULTILINE)
         assert explanation, f"nothing is said of {parameter}"
         if "Quantity" in str(annotation):
-            assert re.search(r"\(in (ps|nm, ps)\b", explanation[1]), f"{parameter} has no unit"
+            assert re.search(r"\(in (K|ps|nm, ps)\b", explanation[1]), f"{parameter} has no unit"
     if name.startswith(("set", "add")) and parameters:
         assert "Raises\n------" in documentation
     returns = re.search(r"Returns\n-------\n.+\n((    .*\n?)+)", documentation)

@@ -6,6 +6,7 @@
 
 #include "openmm/Integrator.h"
 #include "openmm/Kernel.h"
+#include "openmm/internal/OSRngSeed.h"
 #include "openmmvrattle/windowsExportVRattle.h"
 #include <iosfwd>
 #include <map>
@@ -267,6 +268,20 @@ public:
      * @param steps    the number of trial steps
      */
     void calibrate(int steps);
+    /**
+     * Give the particles of the Context random velocities of a temperature that satisfy all constraints, those given as
+     * expressions too: each is drawn from Maxwell's distribution, and all together are projected onto the constraints in the
+     * metric of the masses, so that the mean kinetic energy is kT/2 for each degree of freedom that the constraints leave. It
+     * does what setVelocitiesToTemperature() of the Context does, whose solver leaves expressions alone and can fail where
+     * constraints are strongly coupled.
+     *
+     * Where the positions do not satisfy the constraints, the velocities satisfy them at the positions that the next step starts
+     * from. The forces are computed once, for that step.
+     *
+     * @param temperature    the temperature, in K; not negative
+     * @param randomSeed     the same seed gives the same velocities
+     */
+    void setVelocitiesToTemperature(double temperature, int randomSeed = osrngseed());
     /** Get the step density rho of the last step; 1 before the first step. */
     double getStepDensity() const;
     /**

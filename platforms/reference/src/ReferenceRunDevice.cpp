@@ -26,6 +26,7 @@
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
 #include "run/RunState.h"
+#include "run/StartCheck.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -45,12 +46,22 @@ const int NO_MONITOR_GROUP = -1;
 // Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
 const double FORCE_ROUNDING = 1e-4;
 
-void requireFinite(const vector<Vec3>& vectors, const vector<double>& masses, const std::string& name) {
-    for (size_t i = 0; i < vectors.size(); i++)
+// Whether there is a box in which positions may have been wrapped: one that a Force uses, or that is not OpenMM's default.
+bool hasPeriodicBox(const System& system, const Vec3* boxVectors) {
+    for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
-            if (!std::isfinite(vectors[i][j]) && masses[i] > 0)
-                throw OpenMMException("VariableStepRattleIntegrator: the " + name + " of particle " +
-                                      std::to_string(i) + " is not a finite number; set it before stepping");
+            if (boxVectors[i][j] != (i == j ? 2.0 : 0.0))
+                return true;
+    for (int i = 0; i < system.getNumForces(); i++) {
+        try {
+            if (system.getForce(i).usesPeriodicBoundaryConditions())
+                return true;
+        }
+        catch (const OpenMMException&) {
+            // a Force that does not tell
+        }
+    }
+    return false;
 }
 
 // What a Force may change before a step (ForceImpl::updateContextState). Of OpenMM's own Forces that are mere functions of the
@@ -99,6 +110,9 @@ ReferenceRunDevice::ReferenceRunDevice(ContextImpl& context, OpenMM::ReferencePl
     masses.resize(system.getNumParticles());
     for (int i = 0; i < system.getNumParticles(); i++)
         masses[i] = system.getParticleMass(i);
+    isVirtualSite.resize(system.getNumParticles());
+    for (int i = 0; i < system.getNumParticles(); i++)
+        isVirtualSite[i] = system.isVirtualSite(i);
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
     vector<DistanceConstraint> constraints(system.getNumConstraints());
     for (int i = 0; i < system.getNumConstraints(); i++) {
@@ -200,20 +214,28 @@ unsigned long long ReferenceRunDevice::getFingerprint() {
 }
 
 void ReferenceRunDevice::start() {
-    requireFinite(*data.positions, masses, "position");
-    requireFinite(*data.velocities, masses, "velocity");
-    context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
-    Vectors positions = *data.positions, forces;
-    dynamics->projectPositions(positions);
-    const double energy = computeForcesAt(positions, forces);
-    dynamics->begin(positions, *data.velocities, forces, energy);
+    const bool hasBox = hasPeriodicBox(context.getSystem(), data.periodicBoxVectors);
+    requireSoundStart(dynamics->getConstraintSystem(),
+                      {*data.positions, *data.velocities, isVirtualSite, hasBox ? data.periodicBoxVectors : nullptr});
+    const Vectors before = *data.positions;
+    try {
+        context.computeVirtualSites(); // setPositions() leaves them where the user puts them
+        context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
+        Vectors positions = *data.positions, forces;
+        dynamics->projectPositions(positions);
+        const double energy = computeForcesAt(positions, forces);
+        dynamics->begin(positions, *data.velocities, forces, energy);
+    }
+    catch (...) {
+        *data.positions = before;
+        throw;
+    }
     ahead.reset(new Ahead{*data.positions, *data.velocities});
 }
 
 void ReferenceRunDevice::changeState() {
     Vectors positions = *data.positions, forces;
-    if (!expressions.empty()) // all Forces keep the System's constraints, and none knows of these
-        dynamics->projectPositions(positions);
+    dynamics->projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
     const double energy = computeForcesAt(positions, forces);
     dynamics->changeState(positions, *data.velocities, forces, energy);
     ahead.reset(new Ahead{*data.positions, *data.velocities});
@@ -224,6 +246,12 @@ void ReferenceRunDevice::changeVelocities() {
         return;
     dynamics->changeVelocities(*data.velocities);
     ahead.reset(new Ahead{*data.positions, *data.velocities});
+}
+
+void ReferenceRunDevice::writeVelocities() {
+    writeMoving(dynamics->getVelocities(), *data.velocities);
+    if (ahead != nullptr)
+        ahead->velocities = *data.velocities;
 }
 
 // The forces at positions that may not be those of the Context, which keeps its own; returns the energy of the monitor's group.
@@ -416,7 +444,8 @@ vector<double> ReferenceRunDevice::getMultipliers() {
 double ReferenceRunDevice::computeKineticEnergy() {
     double sum = 0;
     for (size_t i = 0; i < masses.size(); i++)
-        sum += masses[i] * (*data.velocities)[i].dot((*data.velocities)[i]);
+        if (masses[i] > 0) // the velocities of the others have no meaning, and may be no numbers
+            sum += masses[i] * (*data.velocities)[i].dot((*data.velocities)[i]);
     return 0.5 * sum;
 }
 

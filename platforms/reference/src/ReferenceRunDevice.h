@@ -31,6 +31,7 @@ public:
     void start() override;
     void changeState() override;
     void changeVelocities() override;
+    void writeVelocities() override;
     bool hasStarted() override;
     void step(double maxTime) override;
     void settle() override;
@@ -73,6 +74,7 @@ private:
     OpenMM::ReferencePlatform::PlatformData& data;
     const OpenMM::Integrator& integrator;
     std::vector<double> masses;
+    std::vector<char> isVirtualSite;
     std::vector<ExpressionConstraint> expressions;
     std::unique_ptr<VRattleDynamics> dynamics;
     VRattleDynamics::Settings settings;

@@ -1,0 +1,33 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_STARTCHECK_H_
+#define OPENMMVRATTLE_STARTCHECK_H_
+
+#include "constraints/ConstraintSystem.h"
+#include "openmm/Vec3.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/** What a run is to start from. */
+struct StartState {
+    const std::vector<OpenMM::Vec3>&positions, &velocities;
+    /** For each particle whether it is a virtual site, whose position is computed. */
+    const std::vector<char>& isVirtualSite;
+    /** The three vectors of the periodic box in OpenMM's reduced form, or none if there is no such box. */
+    const OpenMM::Vec3* boxVectors;
+};
+
+/**
+ * Refuse a state from which a run would go wrong without a word: positions or velocities that are no numbers, velocities that
+ * no motion has, and molecules that are not whole. It is called before the state is moved onto the constraints, which
+ * would drag the parts of such a molecule together.
+ *
+ * @throws StepFailure    which names the particles and the way out
+ */
+void requireSoundStart(const ConstraintSystem& system, const StartState& state);
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_STARTCHECK_H_
