@@ -101,6 +101,8 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
                });
     };
     std::stable_partition(general.begin(), general.end(), hasNoExpression);
+    std::stable_partition(general.begin(), general.end(),
+                          [](const GeneralCluster& cluster) { return cluster.pieces.size() == 1; });
     for (const GeneralCluster& cluster : general) {
         const int first = getNumConstraints();
         for (const ClusterCut::Piece& piece : cluster.pieces)
@@ -195,29 +197,19 @@ ConstraintSystem::GeneralCluster ConstraintSystem::cutAndOrder(const Given& give
             whole.particles.insert(whole.particles.end(), particles.begin(), particles.end());
         std::sort(whole.particles.begin(), whole.particles.end());
         whole.particles.erase(std::unique(whole.particles.begin(), whole.particles.end()), whole.particles.end());
-        orderForElimination(given, whole.constraints);
-        return {{whole}, {}};
+        const bool hasWideColumns = orderForElimination(given, whole.constraints);
+        return {{whole}, {}, hasWideColumns};
     }
-    GeneralCluster result = {std::move(cut.pieces), std::move(cut.joints)};
+    GeneralCluster result = {std::move(cut.pieces), std::move(cut.joints), true};
     for (int& k : result.joints)
         k = cluster[k];
     for (ClusterCut::Piece& piece : result.pieces) {
         for (int& k : piece.constraints)
             k = cluster[k];
-        orderPiece(given, piece.constraints);
+        orderForElimination(given, piece.constraints);
     }
     orderJoints(given, result);
     return result;
-}
-
-// As orderForElimination(), for constraints that need not be joined.
-void ConstraintSystem::orderPiece(const Given& given, vector<int>& piece) const {
-    vector<int> ordered;
-    for (vector<int>& joined : findClusters(given, piece)) {
-        orderForElimination(given, joined);
-        ordered.insert(ordered.end(), joined.begin(), joined.end());
-    }
-    piece.swap(ordered);
 }
 
 // When the pieces have been eliminated, the joints at the ends of each are coupled.
@@ -242,18 +234,44 @@ void ConstraintSystem::orderJoints(const Given& given, GeneralCluster& cluster) 
             for (int b : joints)
                 if (a > b)
                     entries.emplace(a, b);
-    const vector<int> order = findEliminationOrder((int) cluster.joints.size(), {entries.begin(), entries.end()});
+    const EliminationOrder order = findEliminationOrder((int) cluster.joints.size(), {entries.begin(), entries.end()});
     vector<int> ordered;
-    for (int place : order)
+    for (int place : order.rows)
         ordered.push_back(cluster.joints[place]);
     cluster.joints.swap(ordered);
 }
 
 /*
- * Order the constraints of a cluster so that eliminating them one after the other fills in little, and neighbours in memory
- * are neighbours in the molecule. Two constraints are coupled if they share a moving particle.
+ * Order constraints so that eliminating them one after the other fills in little, and neighbours in memory are neighbours in the
+ * molecule. Two constraints are coupled if they share a moving particle. Returns whether there are wide columns.
  */
-void ConstraintSystem::orderForElimination(const Given& given, vector<int>& cluster) const {
+bool ConstraintSystem::orderForElimination(const Given& given, vector<int>& members) const {
+    vector<int> order;
+    for (const vector<int>& joined : findClusters(given, members)) {
+        const vector<int> walked = walk(given, joined);
+        order.insert(order.end(), walked.begin(), walked.end());
+    }
+    vector<std::pair<int, int>> ends; // particles, and the places of their constraints
+    for (size_t place = 0; place < order.size(); place++)
+        for (int i : findMovingParticles(given, order[place]))
+            ends.emplace_back(i, (int) place);
+    std::sort(ends.begin(), ends.end());
+    MatrixEntries entries;
+    for (size_t a = 0; a < ends.size(); a++)
+        for (size_t b = a; b > 0 && ends[b - 1].first == ends[a].first; b--)
+            if (ends[b - 1].second < ends[a].second)
+                entries.emplace_back(ends[a].second, ends[b - 1].second);
+    std::sort(entries.begin(), entries.end());
+    entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
+    const EliminationOrder best = findEliminationOrder((int) order.size(), entries);
+    members.clear();
+    for (int place : best.rows)
+        members.push_back(order[place]);
+    return best.numNarrow < (int) order.size();
+}
+
+// The constraints of a cluster, or of a connected part of it, in an order in which neighbours are coupled.
+vector<int> ConstraintSystem::walk(const Given& given, const vector<int>& cluster) const {
     std::map<int, vector<int>> constraintsOf;
     bool hasExpression = false;
     for (int k : cluster) {
@@ -261,22 +279,8 @@ void ConstraintSystem::orderForElimination(const Given& given, vector<int>& clus
         for (int i : findMovingParticles(given, k))
             constraintsOf[i].push_back(k);
     }
-    const vector<int> order = hasExpression ? walkThroughConstraints(given, cluster, constraintsOf)
-                                            : walkThroughParticles(given, cluster, constraintsOf);
-    std::map<int, int> placeOf;
-    for (size_t place = 0; place < order.size(); place++)
-        placeOf[order[place]] = (int) place;
-    vector<std::pair<int, int>> entries;
-    for (const auto& list : constraintsOf)
-        for (int a : list.second)
-            for (int b : list.second)
-                if (placeOf[a] > placeOf[b])
-                    entries.emplace_back(placeOf[a], placeOf[b]);
-    std::sort(entries.begin(), entries.end());
-    entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
-    cluster.clear();
-    for (int place : findEliminationOrder((int) order.size(), entries))
-        cluster.push_back(order[place]);
+    return hasExpression ? walkThroughConstraints(given, cluster, constraintsOf)
+                         : walkThroughParticles(given, cluster, constraintsOf);
 }
 
 /*
@@ -410,8 +414,9 @@ void ConstraintSystem::findStretches() {
 
 // The general clusters in parts, with their particles.
 void ConstraintSystem::findParts(const vector<GeneralCluster>& general) {
-    Part open = {firstGeneral, firstGeneral, 0, 0, 0, 0, 0, 0, 0, 0, NONE};
+    Part open = {0, firstGeneral, 0, 0, 0, 0, 0, 0, 0, 0, NONE, 0};
     auto beginNext = [&]() {
+        open.index++;
         open.first = open.end;
         open.firstRow = open.endRow;
         open.firstParticle = open.endParticle;
@@ -424,14 +429,18 @@ void ConstraintSystem::findParts(const vector<GeneralCluster>& general) {
         open.endParticle = (int) generalParticles.size();
     };
     auto closePart = [&]() {
-        if (open.end > open.first)
-            generalParts.push_back(open);
+        if (open.end == open.first)
+            return;
+        wholeParts.push_back(open);
         beginNext();
     };
+    closePart(); // the batches
     for (const GeneralCluster& cluster : general) {
         if (cluster.pieces.size() == 1) {
+            if (cluster.hasWideColumns)
+                closePart();
             extend(cluster.pieces[0].constraints, cluster.pieces[0].particles);
-            if (open.end - open.first >= PART_SIZE)
+            if (cluster.hasWideColumns || open.end - open.first >= PART_SIZE)
                 closePart();
             continue;
         }
@@ -471,8 +480,10 @@ void ConstraintSystem::findGroupRanges() {
             groupRanges.push_back(range.second);
         part.endGroupRange = (int) groupRanges.size();
     };
-    for (Part& part : generalParts)
+    for (Part& part : wholeParts)
         addRangesOf(part);
+    std::copy_if(wholeParts.begin(), wholeParts.end(), std::back_inserter(generalParts),
+                 [&](const Part& part) { return part.first >= firstGeneral; });
     for (Part& piece : pieces)
         addRangesOf(piece);
     for (CutCluster& cut : cutClusters)
@@ -552,16 +563,25 @@ void ConstraintSystem::findCouplings() {
                     std::swap(row, column);
                 couplings.push_back({row, column, ends[p][a].sign * ends[p][b].sign * inverseMasses[p]});
             }
-    // Those of a joint with a piece belong to the piece.
-    auto partOf = [&](const Coupling& coupling) {
-        const int column = getConstraintOf(coupling.column);
-        const auto piece = std::upper_bound(pieces.begin(), pieces.end(), column,
-                                            [](int k, const Part& part) { return k < part.first; });
-        const bool isInPiece = piece != pieces.begin() && column < (piece - 1)->end;
-        return isInPiece ? (piece - 1)->first : getConstraintOf(coupling.row);
+    // By parts, those of a joint with a piece being the piece's: the part of the column is the coupling's. Then by rows.
+    vector<int> partOf(getNumConstraints());
+    auto setPart = [&](const Part& part) {
+        std::fill(partOf.begin() + part.first, partOf.begin() + part.end, part.index);
     };
-    std::stable_sort(couplings.begin(), couplings.end(), [&](const Coupling& a, const Coupling& b) {
-        return std::make_tuple(partOf(a), getConstraintOf(a.row), getConstraintOf(a.column)) <
-               std::make_tuple(partOf(b), getConstraintOf(b.row), getConstraintOf(b.column));
-    });
+    std::for_each(wholeParts.begin(), wholeParts.end(), setPart);
+    std::for_each(pieces.begin(), pieces.end(), setPart);
+    for (const CutCluster& cut : cutClusters)
+        setPart(cut.joints);
+    typedef std::tuple<int, int, int, size_t> Key;
+    vector<Key> keys;
+    for (size_t i = 0; i < couplings.size(); i++) {
+        const int row = getConstraintOf(couplings[i].row), column = getConstraintOf(couplings[i].column);
+        keys.emplace_back(partOf[column], row, column, i);
+    }
+    std::sort(keys.begin(), keys.end());
+    vector<Coupling> sorted;
+    sorted.reserve(couplings.size());
+    for (const Key& key : keys)
+        sorted.push_back(couplings[std::get<3>(key)]);
+    couplings.swap(sorted);
 }

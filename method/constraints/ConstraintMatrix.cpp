@@ -2,111 +2,86 @@
 // SPDX-License-Identifier: MIT
 
 #include "constraints/ConstraintMatrix.h"
-#include "constraints/EliminationOrder.h"
 #include <algorithm>
-#include <set>
 
 using namespace OpenMMVRattle;
 using std::vector;
 
-ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system) : system(system) {
-    const int size = system.getNumConstraints();
-    vector<std::pair<int, int>> entries;
-    for (const auto& coupling : system.getCouplings())
-        if (system.getConstraintOf(coupling.row) != system.getConstraintOf(coupling.column))
-            entries.emplace_back(system.getConstraintOf(coupling.row), system.getConstraintOf(coupling.column));
-    const vector<vector<int>> pattern = findFactorPattern(size, entries);
-    columnStart.assign(1, 0);
-    for (const vector<int>& column : pattern) {
-        rows.insert(rows.end(), column.begin(), column.end());
-        columnStart.push_back(rows.size());
-    }
-    values.resize(rows.size() + size);
-    inversePivots.resize(size);
-    findRemains();
-    findUpdates();
-    findCouplingSlots();
-}
+typedef ConstraintSystem::Part Part;
 
-// Where an entry of the matrix is kept in values.
-size_t ConstraintMatrix::findSlot(int row, int column) const {
-    if (row == column)
-        return rows.size() + row;
-    const auto begin = rows.begin() + columnStart[column], end = rows.begin() + columnStart[column + 1];
-    return (size_t) (std::lower_bound(begin, end, row) - rows.begin());
-}
-
-// Make room for what the pieces leave for the joints.
-void ConstraintMatrix::findRemains() {
-    numJointEntries.assign(system.getPieces().empty() ? 0 : system.getNumConstraints(), 0);
-    for (const ConstraintSystem::Part& piece : system.getPieces()) {
-        Remains r;
-        r.firstEntry = jointSums.size();
-        std::set<int> joints;
-        std::set<size_t> slots;
-        for (int column = piece.first; column < piece.end; column++) {
-            const auto end = rows.begin() + columnStart[column + 1];
-            const auto first = std::lower_bound(rows.begin() + columnStart[column], end, piece.end);
-            numJointEntries[column] = (int) (end - first);
-            jointSums.insert(jointSums.end(), first, end); // the joints, for now
-            joints.insert(first, end);
-            for (auto b = first; b != end; ++b)
-                for (auto a = b; a != end; ++a)
-                    slots.insert(findSlot(*a, *b));
-        }
-        for (int joint : joints)
-            r.terms.push_back({(size_t) joint, numSums++});
-        for (size_t slot : slots) {
-            r.values.push_back({slot, values.size()});
-            values.push_back(0.0);
-        }
-        for (size_t entry = r.firstEntry; entry < jointSums.size(); entry++)
-            jointSums[entry] = (int) findAddition(r.terms, (size_t) jointSums[entry]).source;
-        remains.push_back(r);
-    }
+ConstraintMatrix::PartFactor::PartFactor(const PartAnalysis& analysis) :
+        factor(analysis.pattern), outerSolution(analysis.outer.size()) {
     for (vector<double>& sum : sums)
-        sum.resize(numSums);
+        sum.resize(analysis.outer.size());
 }
 
-const ConstraintMatrix::Addition& ConstraintMatrix::findAddition(const vector<Addition>& additions, size_t target) {
-    return *std::lower_bound(additions.begin(), additions.end(), target,
-                             [](const Addition& addition, size_t t) { return addition.target < t; });
+ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system) :
+        ConstraintMatrix(system, std::make_shared<const Analysis>(analyse(system))) {
 }
 
-void ConstraintMatrix::findUpdates() {
-    const vector<ConstraintSystem::Part>& pieces = system.getPieces();
-    size_t piece = 0;
-    updateStart.assign(1, 0);
-    for (int column = 0; column < system.getNumConstraints(); column++) {
-        while (piece < pieces.size() && column >= pieces[piece].end)
-            piece++;
-        const size_t start = columnStart[column], end = columnStart[column + 1];
-        const size_t firstJoint = end - (numJointEntries.empty() ? 0 : numJointEntries[column]);
-        for (size_t b = start; b < end; b++)
-            for (size_t a = b; a < end; a++) {
-                const size_t slot = findSlot(rows[a], rows[b]);
-                updates.push_back(
-                    (unsigned) (b < firstJoint ? slot : findAddition(remains[piece].values, slot).source));
-            }
-        updateStart.push_back(updates.size());
+ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system, const std::shared_ptr<const Analysis>& analysis) :
+        system(system), analysis(analysis), factors(analysis->begin(), analysis->end()) {
+}
+
+ConstraintMatrix::Analysis ConstraintMatrix::analyse(const ConstraintSystem& system) {
+    Analysis result;
+    const vector<ConstraintSystem::Coupling>& couplings = system.getCouplings();
+    auto rowOf = [&](size_t i) { return system.getConstraintOf(couplings[i].row); };
+    auto columnOf = [&](size_t i) { return system.getConstraintOf(couplings[i].column); };
+    size_t next = 0;
+    // Couplings are in the order of the parts, and in a piece's are those with its joints. More entries are those by other ways.
+    auto add = [&](const Part& part, MatrixEntries entries) {
+        PartAnalysis each;
+        const int size = part.end - part.first;
+        each.first = part.first;
+        each.firstCoupling = next;
+        while (next < couplings.size() && columnOf(next) < part.end) {
+            if (rowOf(next) >= part.end)
+                each.outer.push_back(rowOf(next));
+            next++;
+        }
+        each.endCoupling = next;
+        std::sort(each.outer.begin(), each.outer.end());
+        each.outer.erase(std::unique(each.outer.begin(), each.outer.end()), each.outer.end());
+        auto localRow = [&](int k) {
+            if (k < part.end)
+                return k - part.first;
+            return size + (int) (std::lower_bound(each.outer.begin(), each.outer.end(), k) - each.outer.begin());
+        };
+        for (size_t i = each.firstCoupling; i < each.endCoupling; i++)
+            if (rowOf(i) != columnOf(i))
+                entries.emplace_back(localRow(rowOf(i)), columnOf(i) - part.first);
+        std::sort(entries.begin(), entries.end());
+        entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
+        each.pattern = FactorPattern(size, (int) each.outer.size(), entries);
+        for (size_t i = each.firstCoupling; i < each.endCoupling; i++)
+            each.couplingSlots.push_back(each.pattern.findSlot(localRow(rowOf(i)), columnOf(i) - part.first));
+        result.push_back(std::move(each));
+    };
+    for (const Part& part : system.getWholeParts())
+        add(part, {});
+    for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters()) {
+        const int firstJoint = cluster.joints.first;
+        MatrixEntries left; // for the joints by the pieces
+        const size_t firstPiece = result.size();
+        for (int p = cluster.firstPiece; p < cluster.endPiece; p++) {
+            add(system.getPieces()[p], {});
+            const vector<int>& outer = result.back().outer;
+            for (size_t b = 0; b < outer.size(); b++)
+                for (size_t a = b + 1; a < outer.size(); a++)
+                    left.emplace_back(outer[a] - firstJoint, outer[b] - firstJoint);
+        }
+        const size_t joints = result.size();
+        add(cluster.joints, left);
+        for (size_t piece = firstPiece; piece < joints; piece++) {
+            const vector<int>& outer = result[piece].outer;
+            for (size_t b = 0; b < outer.size(); b++)
+                for (size_t a = b; a < outer.size(); a++)
+                    result[piece].outerSlots.push_back(
+                        result[joints].pattern.findSlot(outer[a] - firstJoint, outer[b] - firstJoint));
+        }
     }
-}
-
-// The couplings are in the order of the parts, and within one in the order of rows; those of a piece with joints are the piece's.
-void ConstraintMatrix::findCouplingSlots() {
-    const int size = system.getNumConstraints();
-    vector<int> endOfPiece(size, ConstraintSystem::NONE);
-    for (const ConstraintSystem::Part& piece : system.getPieces())
-        std::fill(endOfPiece.begin() + piece.first, endOfPiece.begin() + piece.end, piece.end);
-    couplingStart.assign(size + 1, 0);
-    for (const auto& coupling : system.getCouplings()) {
-        const int row = system.getConstraintOf(coupling.row), column = system.getConstraintOf(coupling.column);
-        couplingSlots.push_back((unsigned) findSlot(row, column));
-        couplingStart[endOfPiece[column] == ConstraintSystem::NONE ? row + 1 : endOfPiece[column]] =
-            couplingSlots.size();
-    }
-    for (int k = 0; k < size; k++) // a constraint without any
-        couplingStart[k + 1] = std::max(couplingStart[k], couplingStart[k + 1]);
+    return result;
 }
 
 void ConstraintMatrix::factorize(const ConstraintSystem::Jacobian& jacobian) {
@@ -115,10 +90,10 @@ void ConstraintMatrix::factorize(const ConstraintSystem::Jacobian& jacobian) {
         throwDependent(failed, jacobian);
 }
 
-int ConstraintMatrix::tryToFactorize(const ConstraintSystem::Jacobian& jacobian, const ConstraintSystem::Part& part) {
+int ConstraintMatrix::tryToFactorize(const ConstraintSystem::Jacobian& jacobian, const Part& part) {
     if (part.end == ConstraintSystem::ALL.end) {
         int failed = REGULAR;
-        forParts(part.first, [&](const ConstraintSystem::Part& each) {
+        forParts(part.first, [&](const Part& each) {
             if (failed == REGULAR)
                 failed = tryToFactorize(jacobian, each);
         });
@@ -128,64 +103,50 @@ int ConstraintMatrix::tryToFactorize(const ConstraintSystem::Jacobian& jacobian,
         return failed;
     }
     assemble(jacobian, part);
-    if (part.piece != ConstraintSystem::NONE)
-        for (const Addition& each : remains[part.piece].values)
-            values[each.source] = 0;
-    return eliminateColumns(part);
+    return factorizeAssembled(part);
 }
 
 int ConstraintMatrix::tryToFactorizeJoints(const ConstraintSystem::Jacobian& jacobian,
                                            const ConstraintSystem::CutCluster& cluster) {
     assemble(jacobian, cluster.joints);
-    for (int p = cluster.firstPiece; p < cluster.endPiece; p++)
-        for (const Addition& each : remains[p].values)
-            values[each.target] += values[each.source];
-    return eliminateColumns(cluster.joints);
+    SparseFactor& joints = factors[cluster.joints.index].factor;
+    for (int p = cluster.firstPiece; p < cluster.endPiece; p++) {
+        const int index = system.getPieces()[p].index;
+        const PartAnalysis& piece = (*analysis)[index];
+        const unsigned* slot = piece.outerSlots.data();
+        const size_t size = piece.outer.size();
+        for (size_t b = 0; b < size; b++)
+            for (size_t a = b; a < size; a++)
+                joints.add(*slot++, factors[index].factor.getValue(piece.pattern.getFirstOuterValue() + b * size + a));
+    }
+    return factorizeAssembled(cluster.joints);
 }
 
-// The constraints in no cut cluster, as whole clusters, then the pieces; from the first general one on, or also those in batches.
+// The parts of whole clusters, then the pieces; from the first general constraint on, or also those in batches.
 template <class Task> void ConstraintMatrix::forParts(int first, const Task& task) const {
-    if (first < system.getFirstGeneral())
-        task({first, system.getFirstGeneral(), 0, 0, 0, 0, 0, 0, 0, 0, ConstraintSystem::NONE});
-    for (const ConstraintSystem::Part& part : system.getGeneralParts())
-        task(part);
-    for (const ConstraintSystem::Part& piece : system.getPieces())
+    for (const Part& part : system.getWholeParts())
+        if (part.first >= first)
+            task(part);
+    for (const Part& piece : system.getPieces())
         task(piece);
 }
 
 // The entries of K in the columns of a part.
-void ConstraintMatrix::assemble(const ConstraintSystem::Jacobian& jacobian, const ConstraintSystem::Part& part) {
+void ConstraintMatrix::assemble(const ConstraintSystem::Jacobian& jacobian, const Part& part) {
     const vector<ConstraintSystem::Coupling>& couplings = system.getCouplings();
-    double* diagonal = values.data() + rows.size();
-    std::fill(values.begin() + columnStart[part.first], values.begin() + columnStart[part.end], 0.0);
-    std::fill(diagonal + part.first, diagonal + part.end, 0.0);
+    const PartAnalysis& each = (*analysis)[part.index];
+    SparseFactor& factor = factors[part.index].factor;
+    factor.clear();
     // Two constraints that share several particles have several couplings with one slot, which must add up.
-    for (size_t i = couplingStart[part.first]; i < couplingStart[part.end]; i++)
-        values[couplingSlots[i]] += couplings[i].factor * jacobian[couplings[i].row].dot(jacobian[couplings[i].column]);
-    // The diagonal of K, to compare the pivots with, is kept where their inverses will be.
-    std::copy(diagonal + part.first, diagonal + part.end, inversePivots.begin() + part.first);
+    for (size_t i = each.firstCoupling; i < each.endCoupling; i++)
+        factor.add(each.couplingSlots[i - each.firstCoupling],
+                   couplings[i].factor * jacobian[couplings[i].row].dot(jacobian[couplings[i].column]));
+    factor.keepDiagonal();
 }
 
-int ConstraintMatrix::eliminateColumns(const ConstraintSystem::Part& part) {
-    const double* diagonal = values.data() + rows.size();
-    for (int column = part.first; column < part.end; column++) {
-        const double pivot = diagonal[column];
-        if (!(pivot > MIN_RELATIVE_PIVOT * inversePivots[column]))
-            return column;
-        const double inverse = 1 / pivot;
-        inversePivots[column] = inverse;
-        const size_t start = columnStart[column];
-        const int count = (int) (columnStart[column + 1] - start);
-        const unsigned* update = updates.data() + updateStart[column];
-        double* entry = values.data() + start;
-        for (int b = 0; b < count; b++) {
-            const double scaled = entry[b] * inverse;
-            for (int a = b; a < count; a++)
-                values[*update++] -= entry[a] * scaled;
-            entry[b] = scaled;
-        }
-    }
-    return REGULAR;
+int ConstraintMatrix::factorizeAssembled(const Part& part) {
+    const int failed = factors[part.index].factor.factorize(MIN_RELATIVE_PIVOT);
+    return failed == SparseFactor::REGULAR ? REGULAR : part.first + failed;
 }
 
 void ConstraintMatrix::throwDependent(int constraint, const ConstraintSystem::Jacobian& jacobian) const {
@@ -201,58 +162,39 @@ void ConstraintMatrix::throwDependent(int constraint, const ConstraintSystem::Ja
     throw DependentConstraints(system.getClusterParticles((int) c), system.explainLine((int) c));
 }
 
-void ConstraintMatrix::solve(vector<double>& x, const ConstraintSystem::Part& part) const {
+void ConstraintMatrix::solve(vector<double>& x, const Part& part) const {
     if (part.end == ConstraintSystem::ALL.end) {
-        forParts(part.first, [&](const ConstraintSystem::Part& each) { eliminate(x, each); });
+        forParts(part.first, [&](const Part& each) { eliminate(x, each); });
         for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters())
             solveJoints(x, cluster);
-        forParts(part.first, [&](const ConstraintSystem::Part& each) { substitute(x, each); });
+        forParts(part.first, [&](const Part& each) { substitute(x, each); });
         return;
     }
     eliminate(x, part);
     substitute(x, part);
 }
 
-void ConstraintMatrix::eliminate(vector<double>& x, const ConstraintSystem::Part& part, int channel) const {
-    if (part.piece == ConstraintSystem::NONE) {
-        for (int column = part.first; column < part.end; column++) {
-            const double value = x[column];
-            for (size_t i = columnStart[column]; i < columnStart[column + 1]; i++)
-                x[rows[i]] -= values[i] * value;
-            x[column] = value * inversePivots[column];
-        }
-        return;
-    }
-    const Remains& left = remains[part.piece];
-    double* sum = sums[channel].data();
-    for (const Addition& term : left.terms)
-        sum[term.source] = 0;
-    const int* jointSum = jointSums.data() + left.firstEntry;
-    for (int column = part.first; column < part.end; column++) {
-        const double value = x[column];
-        const size_t end = columnStart[column + 1], firstJoint = end - numJointEntries[column];
-        size_t i = columnStart[column];
-        for (; i < firstJoint; i++)
-            x[rows[i]] -= values[i] * value;
-        for (; i < end; i++)
-            sum[*jointSum++] -= values[i] * value;
-        x[column] = value * inversePivots[column];
-    }
+void ConstraintMatrix::eliminate(vector<double>& x, const Part& part, int channel) const {
+    const PartFactor& each = factors[part.index];
+    std::fill(each.sums[channel].begin(), each.sums[channel].end(), 0.0);
+    each.factor.eliminate(x.data() + part.first, each.sums[channel].data());
 }
 
 void ConstraintMatrix::solveJoints(vector<double>& x, const ConstraintSystem::CutCluster& cluster, int channel) const {
-    for (int p = cluster.firstPiece; p < cluster.endPiece; p++)
-        for (const Addition& term : remains[p].terms)
-            x[term.target] += sums[channel][term.source];
+    for (int p = cluster.firstPiece; p < cluster.endPiece; p++) {
+        const int index = system.getPieces()[p].index;
+        const vector<int>& outer = (*analysis)[index].outer;
+        for (size_t k = 0; k < outer.size(); k++)
+            x[outer[k]] += factors[index].sums[channel][k];
+    }
     eliminate(x, cluster.joints);
     substitute(x, cluster.joints);
 }
 
-void ConstraintMatrix::substitute(vector<double>& x, const ConstraintSystem::Part& part) const {
-    for (int column = part.end - 1; column >= part.first; column--) {
-        double value = x[column];
-        for (size_t i = columnStart[column]; i < columnStart[column + 1]; i++)
-            value -= values[i] * x[rows[i]];
-        x[column] = value;
-    }
+void ConstraintMatrix::substitute(vector<double>& x, const Part& part) const {
+    const PartFactor& each = factors[part.index];
+    const vector<int>& outer = (*analysis)[part.index].outer;
+    for (size_t k = 0; k < outer.size(); k++)
+        each.outerSolution[k] = x[outer[k]];
+    each.factor.substitute(x.data() + part.first, each.outerSolution.data());
 }

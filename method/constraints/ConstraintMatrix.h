@@ -5,15 +5,19 @@
 #define OPENMMVRATTLE_CONSTRAINTMATRIX_H_
 
 #include "constraints/ConstraintSystem.h"
+#include "constraints/FactorPattern.h"
+#include "constraints/SparseFactor.h"
 #include "constraints/StepFailure.h"
+#include <array>
+#include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * The constraint matrix K = G M^-1 G^T and its factorisation L D L^T, in the internal order of the constraints, which is
- * an order of elimination with little fill. Where each number goes is worked out once; a factorisation then runs through a fixed
- * schedule, allocates nothing, and costs time linear in the number of entries of L, that is, of constraints.
+ * The constraint matrix K = G M^-1 G^T and its factorisation, in the internal order of the constraints, which is an order of
+ * elimination with little fill. Where each number goes is worked out once, in an Analysis that several matrices may share; a
+ * factorisation then allocates nothing that grows with it.
  *
  * As in ConstraintSystem, a part of the constraints may be worked on, and several parts by several threads at the same time. Of a
  * cut cluster first all pieces are eliminated; what they leave for the joints is kept apart, so that pieces do not meet. Then come
@@ -21,7 +25,25 @@ namespace OpenMMVRattle {
  */
 class ConstraintMatrix {
 public:
+    /** How the matrix of a part is factorised. The outer rows of a piece are the joints that it has constraints in common with. */
+    struct PartAnalysis {
+        int first;                              // constraint of the part
+        FactorPattern pattern;
+        size_t firstCoupling, endCoupling;      // of ConstraintSystem::getCouplings()
+        std::vector<unsigned> couplingSlots;    // where these go
+        std::vector<int> outer;                 // the joints of a piece, in increasing order
+        std::vector<unsigned>
+            outerSlots; // where the joints' matrix has the entries for these, below the diagonal, column by column
+    };
+    /** Of all parts, by their index. */
+    typedef std::vector<PartAnalysis> Analysis;
+
     explicit ConstraintMatrix(const ConstraintSystem& system);
+    /** A matrix of the same pattern as another. */
+    ConstraintMatrix(const ConstraintSystem& system, const std::shared_ptr<const Analysis>& analysis);
+    const std::shared_ptr<const Analysis>& getAnalysis() const {
+        return analysis;
+    }
     /**
      * Compute and factorise K for a Jacobian.
      *
@@ -42,11 +64,11 @@ public:
 
     /** Replace x by K^-1 x, for all constraints or whole clusters. */
     void solve(std::vector<double>& x, const ConstraintSystem::Part& part = ConstraintSystem::ALL) const;
-    /** The first half, (L D)^-1 x. For the sake of pieces, several x that wait for their joints at once have different channels. */
+    /** The first half, up to the diagonal. For the sake of pieces, several x that wait for their joints at once have different channels. */
     void eliminate(std::vector<double>& x, const ConstraintSystem::Part& part, int channel = 0) const;
     /** Between the halves, K^-1 x for the joints. */
     void solveJoints(std::vector<double>& x, const ConstraintSystem::CutCluster& cluster, int channel = 0) const;
-    /** The second half, L^-T x. */
+    /** The second half. */
     void substitute(std::vector<double>& x, const ConstraintSystem::Part& part) const;
     static constexpr int NUM_CHANNELS = 2;
     /**
@@ -56,38 +78,21 @@ public:
     static constexpr double MIN_RELATIVE_PIVOT = 1e-10;
 
 private:
-    /** Something to be added: of values, or a sum that a piece leaves to an x. */
-    struct Addition {
-        size_t target, source;
+    /** The numbers of a part. */
+    struct PartFactor {
+        explicit PartFactor(const PartAnalysis& analysis);
+        SparseFactor factor;
+        // In the outer rows: what eliminations leave, and the joints' solution.
+        mutable std::array<std::vector<double>, NUM_CHANNELS> sums;
+        mutable std::vector<double> outerSolution;
     };
-    /** What a piece leaves for the joints at its ends. */
-    struct Remains {
-        std::vector<Addition> terms, values; // for x, and for the entries of the matrix
-        size_t firstEntry;                   // in jointSums
-    };
-    size_t findSlot(int row, int column) const;
-    static const Addition& findAddition(const std::vector<Addition>& additions, size_t target);
-    void findRemains();
-    void findUpdates();
-    void findCouplingSlots();
+    static Analysis analyse(const ConstraintSystem& system);
     template <class Task> void forParts(int first, const Task& task) const;
     void assemble(const ConstraintSystem::Jacobian& jacobian, const ConstraintSystem::Part& part);
-    int eliminateColumns(const ConstraintSystem::Part& part);
+    int factorizeAssembled(const ConstraintSystem::Part& part);
     const ConstraintSystem& system;
-    std::vector<size_t> couplingStart;   // of the couplings of each constraint, or of a piece, with those before it
-    std::vector<size_t> columnStart;     // of the entries of L below the diagonal
-    std::vector<int> rows;               // of these entries
-    std::vector<size_t> updateStart;     // of the updates that the elimination of a column makes
-    std::vector<unsigned> updates;       // where they go, in values
-    std::vector<unsigned> couplingSlots; // where the couplings go, in values
-    std::vector<double> values; // the entries below the diagonal, the diagonal, and the remains of the pieces
-    std::vector<double> inversePivots;
-    // If there are pieces:
-    std::vector<Remains> remains; // of each piece
-    std::vector<int> numJointEntries; // the last entries of each column, in the rows of joints
-    std::vector<int> jointSums; // the sum that each of these adds to
-    size_t numSums = 0;
-    mutable std::vector<double> sums[NUM_CHANNELS]; // for the joints, while x is solved for
+    std::shared_ptr<const Analysis> analysis;
+    std::vector<PartFactor> factors;
 };
 
 } // namespace OpenMMVRattle

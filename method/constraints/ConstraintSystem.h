@@ -35,9 +35,9 @@ struct DistanceConstraint {
  * it is the same for g and for 1000 g, and one tolerance serves these constraints too.
  *
  * Constraints are kept in an internal order in which those of one cluster (constraints joined by shared particles) are
- * neighbours: first the small clusters that come in batches of one topology, then the general ones, and of these the ones
- * with an expression last. The functions below work on a part of them: all, one of getGeneralParts(), one of getPieces() of
- * the large clusters, or the joints between these.
+ * neighbours: first the small clusters that come in batches of one topology, then the general ones, of these the ones with an
+ * expression after the others, and last the large ones that are cut. The functions below work on a part of them: all, one of
+ * getGeneralParts(), one of getPieces() of the large clusters, or the joints between these.
  *
  * A particle of mass zero does not move. Only expressions may depend on it; it has no entry in G, and no function below that
  * moves particles writes to it.
@@ -61,15 +61,16 @@ public:
         int firstParticle, endParticle;     // of getGeneralParticles()
         int firstJointEnd, endJointEnd;     // what joints do to the particles of a piece
         int piece;                          // in getPieces(), if it is one; else NONE
+        int index;                          // of all parts
     };
     static constexpr int NONE = -1;
     /** All constraints; with another beginning, all from there on. */
-    static constexpr Part ALL = {0,   std::numeric_limits<int>::max(),
-                                 0,   std::numeric_limits<int>::max(),
-                                 0,   std::numeric_limits<int>::max(),
-                                 0,   0,
-                                 0,   0,
-                                 NONE};
+    static constexpr Part ALL = {0,    std::numeric_limits<int>::max(),
+                                 0,    std::numeric_limits<int>::max(),
+                                 0,    std::numeric_limits<int>::max(),
+                                 0,    0,
+                                 0,    0,
+                                 NONE, NONE};
     /** A large cluster in pieces, of which each is a part, and so are the joints. See ClusterCut. */
     struct CutCluster {
         int firstPiece, endPiece; // of getPieces()
@@ -189,6 +190,10 @@ public:
     const std::vector<Part>& getGeneralParts() const {
         return generalParts;
     }
+    /** The batches, if there are any, as one part, and the general parts. */
+    const std::vector<Part>& getWholeParts() const {
+        return wholeParts;
+    }
     /** The pieces of all large clusters. */
     const std::vector<Part>& getPieces() const {
         return pieces;
@@ -295,6 +300,7 @@ private:
     struct GeneralCluster {
         std::vector<ClusterCut::Piece> pieces;
         std::vector<int> joints;
+        bool hasWideColumns; // for which it is a part of its own
     };
     /** Constraints of an expression group that are in one part: the places first, ..., end - 1 in the group. */
     struct GroupRange {
@@ -307,13 +313,13 @@ private:
     };
     std::vector<int> findMovingParticles(const Given& given, int k) const;
     std::vector<std::vector<int>> findClusters(const Given& given, const std::vector<int>& members) const;
-    void orderForElimination(const Given& given, std::vector<int>& cluster) const;
+    bool orderForElimination(const Given& given, std::vector<int>& members) const;
+    std::vector<int> walk(const Given& given, const std::vector<int>& cluster) const;
     std::vector<int> walkThroughParticles(const Given& given, const std::vector<int>& cluster,
                                           const std::map<int, std::vector<int>>& constraintsOf) const;
     std::vector<int> walkThroughConstraints(const Given& given, const std::vector<int>& cluster,
                                             const std::map<int, std::vector<int>>& constraintsOf) const;
     GeneralCluster cutAndOrder(const Given& given, const std::vector<int>& cluster) const;
-    void orderPiece(const Given& given, std::vector<int>& piece) const;
     void orderJoints(const Given& given, GeneralCluster& cluster) const;
     void append(const Given& given, const std::vector<int>& members);
     void groupExpressions(const Given& given);
@@ -345,7 +351,7 @@ private:
     std::vector<Coupling> couplings;
     std::vector<std::unique_ptr<ClusterBatch>> batches;
     std::vector<Block> blocks;
-    std::vector<Part> generalParts, pieces;
+    std::vector<Part> wholeParts, generalParts, pieces;
     std::vector<CutCluster> cutClusters;
     std::vector<JointEnd> jointEnds;
     std::vector<int> generalParticles, freeParticles;

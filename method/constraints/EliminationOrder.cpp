@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <numeric>
 
-using std::pair;
 using std::vector;
 
 namespace OpenMMVRattle {
@@ -15,11 +14,11 @@ namespace OpenMMVRattle {
 namespace {
 
 // The entries after row order[i] has become row i.
-vector<pair<int, int>> reorder(const vector<pair<int, int>>& entries, const vector<int>& order) {
+MatrixEntries reorder(const MatrixEntries& entries, const vector<int>& order) {
     vector<int> place(order.size());
     for (size_t i = 0; i < order.size(); i++)
         place[order[i]] = (int) i;
-    vector<pair<int, int>> result;
+    MatrixEntries result;
     for (const auto& entry : entries) {
         const int a = place[entry.first], b = place[entry.second];
         result.emplace_back(std::max(a, b), std::min(a, b));
@@ -27,14 +26,7 @@ vector<pair<int, int>> reorder(const vector<pair<int, int>>& entries, const vect
     return result;
 }
 
-size_t countEntries(const vector<vector<int>>& pattern) {
-    size_t count = 0;
-    for (const auto& column : pattern)
-        count += column.size();
-    return count;
-}
-
-vector<int> findMinimumDegreeOrder(int size, const vector<pair<int, int>>& entries) {
+vector<int> findMinimumDegreeOrder(int size, const MatrixEntries& entries) {
     vector<Eigen::Triplet<double>> triplets;
     for (int i = 0; i < size; i++)
         triplets.emplace_back(i, i, 1.0);
@@ -49,46 +41,109 @@ vector<int> findMinimumDegreeOrder(int size, const vector<pair<int, int>>& entri
     return vector<int>(permutation.indices().data(), permutation.indices().data() + size);
 }
 
-} // namespace
-
-vector<vector<int>> findFactorPattern(int size, const vector<pair<int, int>>& entries) {
-    vector<vector<int>> pattern(size), children(size);
-    for (const auto& entry : entries)
-        pattern[entry.second].push_back(entry.first);
+// The wide columns, each after all those below it in the tree. The last one before a column is one with the same entries, if there is
+// any.
+vector<int> orderWide(const EliminationTree& tree, const vector<char>& isWide) {
+    const int size = (int) isWide.size();
+    vector<vector<int>> children(size);
+    vector<int> stack, result;
+    for (int column = size - 1; column >= 0; column--) // so that the first child is taken from the stack first
+        if (isWide[column]) {
+            const int parent = tree.parent[column];
+            if (parent == EliminationTree::NONE)
+                stack.push_back(column);
+            else
+                children[parent].push_back(column);
+        }
     for (int column = 0; column < size; column++) {
-        // What the columns below it in the elimination tree leave, beside the matrix's own entries.
-        vector<int>& rows = pattern[column];
-        for (int child : children[column])
-            rows.insert(rows.end(), pattern[child].begin() + 1, pattern[child].end());
-        std::sort(rows.begin(), rows.end());
-        rows.erase(std::unique(rows.begin(), rows.end()), rows.end());
-        if (!rows.empty())
-            children[rows[0]].push_back(column);
+        const auto same = std::find_if(children[column].begin(), children[column].end(),
+                                       [&](int child) { return tree.counts[child] == tree.counts[column] + 1; });
+        if (same != children[column].end())
+            std::rotate(children[column].begin(), same, same + 1);
     }
-    return pattern;
+    // A column comes twice: at first its children are put before it.
+    vector<char> isOpen(size, false);
+    while (!stack.empty()) {
+        const int column = stack.back();
+        if (isOpen[column]) {
+            result.push_back(column);
+            stack.pop_back();
+            continue;
+        }
+        isOpen[column] = true;
+        stack.insert(stack.end(), children[column].begin(), children[column].end());
+    }
+    return result;
 }
 
-vector<int> findEliminationOrder(int size, const vector<pair<int, int>>& entries) {
+} // namespace
+
+// The tree by the algorithm of Liu (ACM Trans. Math. Softw. 12, 1986); the counts by a walk along the entries of each row of L.
+EliminationTree findEliminationTree(int size, const MatrixEntries& entries, size_t maxEntries) {
+    vector<size_t> start(size + 1, 0);
+    for (const auto& entry : entries)
+        start[entry.first + 1]++;
+    std::partial_sum(start.begin(), start.end(), start.begin());
+    vector<int> columns(entries.size());
+    vector<size_t> next(start.begin(), start.end() - 1);
+    for (const auto& entry : entries)
+        columns[next[entry.first]++] = entry.second;
+
+    const int NONE = EliminationTree::NONE;
+    EliminationTree tree = {vector<int>(size, NONE), vector<int>(size, 0), 0};
+    vector<int> ancestor(size, NONE), visited(size, NONE);
+    for (int row = 0; row < size; row++)
+        for (size_t k = start[row]; k < start[row + 1]; k++) {
+            int column = columns[k];
+            while (ancestor[column] != NONE && ancestor[column] != row)
+                column = std::exchange(ancestor[column], row);
+            if (ancestor[column] == NONE)
+                ancestor[column] = tree.parent[column] = row;
+        }
+    for (int row = 0; row < size && tree.numEntries <= maxEntries; row++) {
+        visited[row] = row;
+        for (size_t k = start[row]; k < start[row + 1]; k++)
+            for (int column = columns[k]; visited[column] != row; column = tree.parent[column]) {
+                visited[column] = row;
+                tree.counts[column]++;
+                tree.numEntries++;
+            }
+    }
+    return tree;
+}
+
+EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
     vector<int> order(size);
     std::iota(order.begin(), order.end(), 0);
-    vector<vector<int>> pattern = findFactorPattern(size, entries);
-    if (countEntries(pattern) > entries.size()) { // there is fill, so another order may have less
+    EliminationTree tree = findEliminationTree(size, entries, entries.size());
+    if (tree.numEntries > entries.size()) { // there is fill, so another order may have less
         vector<int> other = findMinimumDegreeOrder(size, entries);
-        vector<vector<int>> otherPattern = findFactorPattern(size, reorder(entries, other));
-        if (countEntries(otherPattern) < countEntries(pattern)) {
+        EliminationTree otherTree = findEliminationTree(size, reorder(entries, other));
+        tree = findEliminationTree(size, entries, otherTree.numEntries);
+        if (otherTree.numEntries < tree.numEntries) {
             order.swap(other);
-            pattern.swap(otherPattern);
+            tree = std::move(otherTree);
         }
     }
-    vector<int> level(size, 0), places(size);
-    for (int column = 0; column < size; column++)
-        if (!pattern[column].empty())
-            level[pattern[column][0]] = std::max(level[pattern[column][0]], level[column] + 1);
-    std::iota(places.begin(), places.end(), 0);
+    vector<int> level(size, 0), places;
+    vector<char> isWide(size);
+    for (int column = 0; column < size; column++) {
+        isWide[column] = isWide[column] || tree.counts[column] >= EliminationOrder::WIDE;
+        if (!isWide[column])
+            places.push_back(column);
+        const int parent = tree.parent[column];
+        if (parent == EliminationTree::NONE)
+            continue;
+        level[parent] = std::max(level[parent], level[column] + 1);
+        isWide[parent] = isWide[parent] || isWide[column];
+    }
     std::stable_sort(places.begin(), places.end(), [&](int a, int b) { return level[a] < level[b]; });
+    const int numNarrow = (int) places.size();
+    const vector<int> wide = orderWide(tree, isWide);
+    places.insert(places.end(), wide.begin(), wide.end());
     for (int& place : places)
         place = order[place];
-    return places;
+    return {places, numNarrow};
 }
 
 } // namespace OpenMMVRattle

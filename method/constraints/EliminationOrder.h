@@ -4,32 +4,52 @@
 #ifndef OPENMMVRATTLE_ELIMINATIONORDER_H_
 #define OPENMMVRATTLE_ELIMINATIONORDER_H_
 
+#include <cstddef>
+#include <limits>
 #include <utility>
 #include <vector>
 
 namespace OpenMMVRattle {
 
-/**
- * The pattern of the factor L of a sparse symmetric matrix L D L^T: for each column the rows below the diagonal, in increasing
- * order.
- *
- * @param size       the number of rows
- * @param entries    the entries (row, column) of the matrix below the diagonal, row > column
- */
-std::vector<std::vector<int>> findFactorPattern(int size, const std::vector<std::pair<int, int>>& entries);
+/** The entries (row, column) of a sparse symmetric matrix below the diagonal, row > column. */
+typedef std::vector<std::pair<int, int>> MatrixEntries;
+
+/** What the elimination of a sparse symmetric matrix L D L^T, column by column, does to its columns. */
+struct EliminationTree {
+    static constexpr int NONE = -1;
+    std::vector<int> parent; // the first row below the diagonal of each column of L, or NONE
+    std::vector<int> counts; // the entries below the diagonal of each column of L
+    size_t numEntries;       // all of them
+};
 
 /**
- * Find an order of elimination with little fill, in which steps that do not depend on each other are neighbours.
+ * Find the tree; time in proportion to the entries of L, memory to those of the matrix.
+ *
+ * @param size          the number of rows
+ * @param entries       the entries of the matrix
+ * @param maxEntries    counting stops when there are more entries than this
+ */
+EliminationTree findEliminationTree(int size, const MatrixEntries& entries,
+                                    size_t maxEntries = std::numeric_limits<size_t>::max());
+
+/** An order in which the rows of a matrix are eliminated. */
+struct EliminationOrder {
+    /** A column with so many entries is wide: it is worked on in dense blocks, and so are all that its elimination reaches. */
+    static constexpr int WIDE = 32;
+    std::vector<int> rows; // for each place the row that takes it
+    int numNarrow;         // of the columns that are not wide, which come first
+};
+
+/**
+ * Find an order of elimination with little fill, in which narrow columns that do not depend on each other are neighbours, and so
+ * are wide ones with the same entries.
  *
  * Of the given order and that of approximate minimum degree (Amestoy, Davis and Duff, SIAM J. Matrix Anal. Appl. 17, 1996) the one
- * with less fill is taken, and sorted by the level in its elimination tree; the fill stays the same, and a processor can work on
- * several eliminations of one level at once, on a chain from both ends.
- *
- * @param size       the number of rows
- * @param entries    the entries of the matrix below the diagonal
- * @return for each place in the new order the row that takes it
+ * with less fill is taken. Narrow columns are sorted by the level in their elimination tree; the fill stays the same, and a
+ * processor can work on several eliminations of one level at once, on a chain from both ends. Wide ones come after them, each as
+ * soon as all that it depends on has been eliminated.
  */
-std::vector<int> findEliminationOrder(int size, const std::vector<std::pair<int, int>>& entries);
+EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries);
 
 } // namespace OpenMMVRattle
 

@@ -589,10 +589,7 @@ static size_t countFill(const ConstraintSystem& system) {
         if (row != column)
             entries.emplace_back(row, column);
     }
-    size_t count = 0;
-    for (const auto& column : findFactorPattern(system.getNumConstraints(), entries))
-        count += column.size();
-    return count;
+    return findEliminationTree(system.getNumConstraints(), entries).numEntries;
 }
 
 // A rod: sections of three particles, each rigid, joined by three expressions of both; the first is an anchor.
