@@ -21,6 +21,7 @@
 #include <cmath>
 #include <limits>
 #include <random>
+#include <sstream>
 
 namespace OpenMMVRattle {
 
@@ -406,20 +407,176 @@ inline void testBadSystems() {
     noConstraints.addMonitor(Integrator_::ConstraintMultipliers);
     assertThrows("has no constraints", [&] { Context context(free, noConstraints, getTestPlatform()); });
 
-    // Nothing pulls at the start, so the multipliers are no measure.
-    TestSystem still;
-    makeChain(still, 4);
-    while (still.system.getNumForces() > 0)
-        still.system.removeForce(0);
-    still.velocities.assign(4, Vec3());
+    TestSystem chain;
+    makeChain(chain, 4);
     VariableStepRattleIntegrator integrator(0.001);
-    Run stillRun(still, integrator);
-    assertThrows("zero at the first step", [&] { integrator.step(1); });
-    integrator.setReferenceMonitorValue(10.0);
-    integrator.step(10);
-
-    stillRun.context.setPositions({Vec3(), Vec3(std::nan(""), 0, 0), Vec3(), Vec3()});
+    Run chainRun(chain, integrator);
+    chainRun.context.setPositions({Vec3(), Vec3(std::nan(""), 0, 0), Vec3(), Vec3()});
     assertThrows("position of particle 1", [&] { integrator.step(1); });
+}
+
+const Integrator_::MonitorKind ALL_MONITORS[] = {Integrator_::ConstraintMultipliers,
+                                                 Integrator_::ConstraintForce,
+                                                 Integrator_::AppliedForce,
+                                                 Integrator_::ConstraintAndAppliedForce,
+                                                 Integrator_::MultiplierPNorm,
+                                                 Integrator_::ForcePNorm,
+                                                 Integrator_::VectorField,
+                                                 Integrator_::MaxForce,
+                                                 Integrator_::ArcLength,
+                                                 Integrator_::MaxParticleArcLength,
+                                                 Integrator_::ForceGroupEnergy};
+
+// A start where nothing pulls and nothing moves, with any monitor: steps have the nominal size until the monitor is more than
+// rounding, and then it has a reference value.
+inline void testCalmStarts() {
+    for (const Integrator_::MonitorKind kind : ALL_MONITORS)
+        for (const bool isGiven : {false, true})
+            for (const bool isUnbounded : {false, true}) {
+                TestSystem t;
+                makeChain(t, 4);
+                while (t.system.getNumForces() > 0)
+                    t.system.removeForce(0);
+                // No force before 0.01 ps, which the Context's parameter stands for.
+                CustomExternalForce* field = new CustomExternalForce("on*(m*y^2 + 3*x*y)");
+                field->addGlobalParameter("on", 0.0);
+                field->addPerParticleParameter("m");
+                for (int i = 0; i < 4; i++)
+                    field->addParticle(i, {1000.0 * (i + 1)});
+                t.system.addForce(field);
+                if (kind == Integrator_::ForceGroupEnergy) {
+                    CustomExternalForce* monitor = new CustomExternalForce("on*(1+x^2)");
+                    monitor->addGlobalParameter("on", 0.0);
+                    monitor->addParticle(2);
+                    monitor->setForceGroup(31);
+                    t.system.addForce(monitor);
+                }
+                t.velocities.assign(4, Vec3());
+                Integrator_ integrator(0.001);
+                integrator.clearMonitors();
+                integrator.addMonitor(kind);
+                if (isGiven)
+                    integrator.setReferenceMonitorValue(10.0);
+                if (isUnbounded) {
+                    integrator.setMinimumStepSize(0);
+                    integrator.setMaximumStepSize(0);
+                }
+                Run run(t, integrator);
+                for (int i = 1; i <= 10; i++) {
+                    integrator.step(1);
+                    ASSERT_EQUAL(0.001, integrator.getStepSize());
+                    ASSERT_EQUAL(1.0, integrator.getStepDensity());
+                    ASSERT_EQUAL(i + 1, integrator.getNumForceEvaluations());
+                    ASSERT_EQUAL(isGiven ? 10.0 : 0.0, integrator.getReferenceMonitorValue());
+                }
+                ASSERT(largestDifference(t.positions, run.positions()) < 1e-15);
+                integrator.reverse();
+                const std::string checkpoint = [&] {
+                    std::stringstream stream;
+                    run.context.createCheckpoint(stream);
+                    return stream.str();
+                }();
+                std::stringstream stream(checkpoint);
+                run.context.loadCheckpoint(stream);
+                integrator.step(1);
+                ASSERT_EQUAL(0.001, integrator.getStepSize());
+                run.context.setParameter("on", 1.0);
+                for (int i = 0; i < 10; i++)
+                    integrator.step(1);
+                if (!isGiven) {
+                    ASSERT(integrator.getReferenceMonitorValue() > 0);
+                    ASSERT(integrator.getStepDensity() != 1.0);
+                }
+            }
+}
+
+// Of several monitors those that are more than rounding have their say at once.
+inline void testCalmMonitorAmongOthers() {
+    TestSystem t;
+    makeChain(t, 2, 0.0);
+    while (t.system.getNumForces() > 0)
+        t.system.removeForce(0);
+    // Two particles on a rigid rod that fall side by side into a wall: nothing pulls at the rod, ever.
+    const Vec3 r = t.positions[1] - t.positions[0];
+    t.system.setConstraintParameters(0, 0, 1, std::fabs(r[0]));
+    t.positions = {Vec3(0, 0.5, 0), Vec3(r[0], 0.5, 0)};
+    t.velocities = {Vec3(0, -1, 0), Vec3(0, -1, 0)};
+    CustomExternalForce* wall = new CustomExternalForce("m*(0.3/y)^6");
+    wall->addPerParticleParameter("m");
+    for (int i = 0; i < 2; i++)
+        wall->addParticle(i, {t.system.getParticleMass(i)});
+    t.system.addForce(wall);
+    Integrator_ integrator(0.002);
+    integrator.clearMonitors();
+    integrator.addMonitor(Integrator_::ConstraintForce);
+    integrator.addMonitor(Integrator_::AppliedForce);
+    integrator.setMinimumStepSize(0);
+    Run run(t, integrator);
+    const double energy = totalEnergy(run.context);
+    double smallest = 1;
+    for (int i = 0; i < 2000 && run.context.getTime() < 1.0; i++) {
+        integrator.step(1);
+        smallest = std::min(smallest, integrator.getStepSize());
+        ASSERT_EQUAL_TOL(energy, totalEnergy(run.context), 1e-2);
+    }
+    ASSERT_EQUAL(0.0, integrator.getReferenceMonitorValue(0));
+    ASSERT(integrator.getReferenceMonitorValue(1) > 0);
+    ASSERT(smallest < 0.0005);
+    ASSERT(run.velocities()[0][1] > 0.9); // it has bounced back
+}
+
+// A fresh integrator runs on every System: without constraints its monitor is another one. One that was named is refused there.
+inline void testDefaultMonitor() {
+    Integrator_::MonitorKind kind;
+    double weight, power;
+    System free, massless, bound;
+    for (System* system : {&free, &massless, &bound}) {
+        system->addParticle(system == &massless ? 0.0 : 2.0);
+        system->addParticle(system == &massless ? 0.0 : 2.0);
+        HarmonicBondForce* bond = new HarmonicBondForce();
+        bond->addBond(0, 1, 0.1, 1000);
+        system->addForce(bond);
+        if (system != &free)
+            system->addConstraint(0, 1, 0.2);
+        Integrator_ integrator(0.001);
+        Context context(*system, integrator, getTestPlatform());
+        context.setPositions({Vec3(), Vec3(0.2, 0, 0)});
+        context.setVelocities({Vec3(0, 0.1, 0), Vec3()});
+        integrator.step(20);
+        integrator.getMonitor(0, kind, weight, power);
+        ASSERT_EQUAL(system == &bound ? Integrator_::ConstraintMultipliers : Integrator_::ConstraintAndAppliedForce,
+                     kind);
+        ASSERT(system == &massless || integrator.getReferenceMonitorValue() > 0);
+        // The same in a Context that has been made anew with or without the constraint.
+        if (system == &bound)
+            system->removeConstraint(0);
+        else if (system == &free)
+            system->addConstraint(0, 1, 0.2);
+        if (system != &massless) {
+            context.reinitialize(true);
+            integrator.getMonitor(0, kind, weight, power);
+            ASSERT_EQUAL(system == &free ? Integrator_::ConstraintMultipliers : Integrator_::ConstraintAndAppliedForce,
+                         kind);
+            ASSERT_EQUAL(0.0, integrator.getReferenceMonitorValue()); // that was of the other monitor
+            integrator.step(5);
+        }
+    }
+    // An expression is a constraint as well.
+    Integrator_ withExpression(0.001);
+    withExpression.addConstraint("x1-x2+0.2", {0, 1});
+    System plain;
+    plain.addParticle(1.0);
+    plain.addParticle(1.0);
+    Context context(plain, withExpression, getTestPlatform());
+    withExpression.getMonitor(0, kind, weight, power);
+    ASSERT_EQUAL(Integrator_::ConstraintMultipliers, kind);
+    // A monitor is named by adding it, or by giving it a reference value.
+    Integrator_ named(0.001), given(0.001);
+    named.clearMonitors();
+    named.addMonitor(Integrator_::ConstraintMultipliers);
+    given.setReferenceMonitorValue(100.0);
+    for (Integrator_* integrator : {&named, &given})
+        assertThrows("has no constraints", [&] { Context refused(plain, *integrator, getTestPlatform()); });
 }
 
 inline void testMultipliers() {
@@ -498,8 +655,11 @@ inline void testForceGroups() {
     VariableStepRattleIntegrator integrator(0.01);
     integrator.clearMonitors();
     integrator.addMonitor(Integrator_::ForceGroupEnergy);
+    ASSERT_EQUAL(-1 & ~(1 << 31), integrator.getIntegrationForceGroups());
     integrator.setMonitorForceGroup(5);
+    ASSERT_EQUAL(-1 & ~(1 << 5), integrator.getIntegrationForceGroups());
     integrator.setIntegrationForceGroups(0xFFFFFFFF & ~(1 << 3));
+    ASSERT_EQUAL(-1 & ~(1 << 3) & ~(1 << 5), integrator.getIntegrationForceGroups());
     integrator.setMinimumStepSize(0);
     integrator.setMaximumStepSize(0);
     Context context(system, integrator, getTestPlatform());
@@ -511,6 +671,13 @@ inline void testForceGroups() {
     ASSERT_EQUAL(0.0, state.getPositions()[0][1]);
     ASSERT_EQUAL_TOL(1 + x * x, integrator.getMonitorValue(), 1e-6);
     ASSERT_EQUAL_TOL(2.0, integrator.getReferenceMonitorValue(), 1e-3);
+    // The energy of the run, as reporters and the minimizer ask for it, is that of the acting forces alone.
+    const double energy =
+        context.getState(State::Energy, false, integrator.getIntegrationForceGroups()).getPotentialEnergy();
+    ASSERT_EQUAL_TOL(2 * x, energy, 1e-6);
+    // The group is there again when the monitor is not.
+    integrator.clearMonitors();
+    ASSERT_EQUAL(-1 & ~(1 << 3), integrator.getIntegrationForceGroups());
 }
 
 inline void testMasslessAndVirtual() {
@@ -638,6 +805,9 @@ inline TestList getIntegratorTests() {
         {"a failed step leaves the state", testFailedStep},
         {"an infinite force leaves the state", testForceThatBecomesInfinite},
         {"bad systems", testBadSystems},
+        {"calm starts", testCalmStarts},
+        {"a calm monitor among others", testCalmMonitorAmongOthers},
+        {"default monitor", testDefaultMonitor},
         {"multipliers", testMultipliers},
         {"changes by the user", testChangesOfState},
         {"force groups", testForceGroups},

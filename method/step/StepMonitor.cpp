@@ -142,7 +142,7 @@ void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipli
 double StepMonitor::derivativeOfU(size_t index, const vector<double>& values, double u) const {
     const Term& term = terms[index];
     // U is not differentiable at zero; any value serves, since it only guides the iteration.
-    if (!(values[index] > 0) || !(u > 0))
+    if (!(values[index] > 0) || !(u > 0) || term.reference == 0)
         return 0;
     double sumOfWeights = 0;
     for (const Term& each : terms)
@@ -263,38 +263,74 @@ double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vect
 }
 
 bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v,
-                               const ConstraintSystem::Jacobian& jacobian) const {
+                               const ConstraintSystem::Jacobian& jacobian, double speed, double acceleration) const {
     if (!(value > 0))
         return true;
-    Kind kind = terms[index].kind;
-    if (!usesConstraintsOnly(kind))
-        return false;
-    // Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
+    switch (terms[index].kind) {
+    case ConstraintMultipliers:
+    case MultiplierPNorm:
+        return value <= findMultiplierRounding(false, v, jacobian, acceleration);
+    case ConstraintForce:
+        return value <= findMultiplierRounding(true, v, jacobian, acceleration);
+    case ConstraintAndAppliedForce:
+        return areForcesNegligible(acceleration) &&
+               value * value - appliedForceSquared <=
+                   std::pow(findMultiplierRounding(true, v, jacobian, acceleration), 2);
+    case AppliedForce:
+    case ForcePNorm:
+    case MaxForce:
+        return areForcesNegligible(acceleration);
+    case VectorField:
+    case ArcLength:
+    case MaxParticleArcLength:
+        return areForcesNegligible(acceleration) &&
+               std::all_of(v.begin(), v.end(), [&](const Vec3& each) { return each.dot(each) <= speed * speed; });
+    case ForceGroupEnergy:
+        break;
+    }
+    return false;
+}
+
+bool StepMonitor::areForcesNegligible(double acceleration) const {
+    for (int i = 0; i < system.getNumParticles(); i++)
+        if (squareOf((*forces)[i], i) > std::pow(system.getMasses()[i] * acceleration, 2))
+            return false;
+    return true;
+}
+
+// Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
+double StepMonitor::findMultiplierRounding(bool isMassWeighted, const vector<Vec3>& v,
+                                           const ConstraintSystem::Jacobian& jacobian, double acceleration) const {
+    const double fraction = 1e-12;
     double largest = 0;
     const vector<double>& inverseMasses = system.getInverseMasses();
     auto forceOn = [&](int i, double length) {
-        return std::sqrt((*forces)[i].dot((*forces)[i])) + v[i].dot(v[i]) / (inverseMasses[i] * length);
+        return fraction * (std::sqrt((*forces)[i].dot((*forces)[i])) + v[i].dot(v[i]) / (inverseMasses[i] * length));
     };
     for (int k = 0; k < system.getNumConstraints(); k++) {
         if (system.isExpression(k))
             continue;
         const DistanceConstraint& c = system.getConstraint(k);
+        const double lighter = 1 / std::max(inverseMasses[c.particle1], inverseMasses[c.particle2]);
         for (int i : {c.particle1, c.particle2})
             if (inverseMasses[i] > 0)
-                largest = std::max(largest, kind == ConstraintForce ? forceOn(i, c.length) * std::sqrt(inverseMasses[i])
-                                                                    : forceOn(i, c.length) / (2 * c.length));
+                largest = std::max(largest,
+                                   isMassWeighted
+                                       ? (forceOn(i, c.length) + lighter * acceleration) * std::sqrt(inverseMasses[i])
+                                       : (forceOn(i, c.length) + lighter * acceleration) / (2 * c.length));
     }
     for (const ConstraintSystem::ExpressionRow& row : system.getExpressionRows()) {
         double product = 0, square = 0; // G M^-1 F without cancellation, and the diagonal of K
         for (int entry = row.first; entry < row.end; entry++) {
             const int i = system.getParticleOf(entry);
             const double rowSquared = jacobian[entry].dot(jacobian[entry]);
-            product += std::sqrt(rowSquared) * forceOn(i, ConstraintSystem::EXPRESSION_LENGTH) * inverseMasses[i];
+            product += std::sqrt(rowSquared) *
+                       (forceOn(i, ConstraintSystem::EXPRESSION_LENGTH) * inverseMasses[i] + acceleration);
             square += rowSquared * inverseMasses[i];
         }
-        largest = std::max(largest, product / (kind == ConstraintForce ? std::sqrt(square) : square));
+        largest = std::max(largest, product / (isMassWeighted ? std::sqrt(square) : square));
     }
-    return value <= 1e-12 * largest;
+    return largest;
 }
 
 double StepMonitor::combine(const vector<double>& values) const {
@@ -302,7 +338,8 @@ double StepMonitor::combine(const vector<double>& values) const {
         return 1;
     double sum = 0, sumOfWeights = 0;
     for (size_t i = 0; i < terms.size(); i++) {
-        double t = terms[i].weight * std::pow(values[i] / terms[i].reference, terms[i].power);
+        const double ratio = terms[i].reference > 0 ? values[i] / terms[i].reference : 1.0;
+        const double t = terms[i].weight * std::pow(ratio, terms[i].power);
         sum += t * t;
         sumOfWeights += terms[i].weight * terms[i].weight;
     }

@@ -112,10 +112,16 @@ public:
     double evaluateRate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
                         const std::vector<double>& rightSide, const std::vector<double>& values,
                         const std::vector<OpenMM::Vec3>& velocityRate, const std::vector<double>& multiplierRate) const;
-    /** Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls. */
+    /**
+     * Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls, or of forces that cancel
+     * each other.
+     *
+     * @param speed           one that changes no position by more than rounding in a step (nm/ps)
+     * @param acceleration    the same of an acceleration (nm/ps^2)
+     */
     bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v,
-                      const ConstraintSystem::Jacobian& jacobian) const;
-    /** u, the combination of the values; 1 if there is no term. */
+                      const ConstraintSystem::Jacobian& jacobian, double speed, double acceleration) const;
+    /** u, the combination of the values; 1 if there is no term. A term without a reference counts as if it had its value there. */
     double combine(const std::vector<double>& values) const;
     /**
      * du/dv at the state of the last evaluate().
@@ -133,6 +139,9 @@ public:
 
 private:
     double squareOf(const OpenMM::Vec3& force, int particle) const;
+    bool areForcesNegligible(double acceleration) const;
+    double findMultiplierRounding(bool isMassWeighted, const std::vector<OpenMM::Vec3>& v,
+                                  const ConstraintSystem::Jacobian& jacobian, double acceleration) const;
     double evaluateTerm(size_t index, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
     int findFastest(const std::vector<OpenMM::Vec3>& v) const;

@@ -24,9 +24,9 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
                                  const vector<ExpressionConstraint>& expressions) :
         system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
         automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
-        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), factorScope(NoFactor),
-        isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0), isRescued(false),
-        numIterations(0), numRescues(0), lastError(0) {
+        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false),
+        factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
+        isRescued(false), numIterations(0), numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -346,14 +346,7 @@ double VRattleDynamics::step(double maxStep) {
         if (settings.isAutomatic && !settings.isFixedStep)
             throw StepFailure("the automatic step control has not been started");
         stepKind = First;
-        rhoNext = 1;
-        const vector<StepMonitor::Term>& terms = monitor.getTerms();
-        bool hasReferences =
-            std::all_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return term.reference > 0; });
-        if (firstDensity > 0)
-            rhoNext = firstDensity;
-        else if (hasReferences)
-            rhoNext = combineAndLimit(values);
+        rhoNext = firstDensity > 0 ? firstDensity : findFirstDensity();
         full = settings.stepSize / rhoNext;
         if (!std::isfinite(full))
             throw StepFailure("the monitor is zero and there is no maximum step size; set one");
@@ -375,7 +368,7 @@ double VRattleDynamics::step(double maxStep) {
 }
 
 bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
-    const bool isStart = stepKind == First && !settings.isFixedStep && !monitor.isEmpty();
+    const bool isStart = stepKind == First && !isCalm && !settings.isFixedStep && !monitor.isEmpty();
     vector<double> backValues, startValues;
     bool hasBack = false;
     if (isStart) {
@@ -391,6 +384,10 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
         automatic.measure(vNext, forces, lambdaOnStep, rightSideNext, wNext, stepNext, force);
     // From here on nothing fails.
     work.endStep();
+    if (stepKind == First && isCalm)
+        for (size_t k = 0; k < values.size(); k++)
+            if (monitor.getTerms()[k].reference == 0 && !isNegligible[k])
+                monitor.setReference((int) k, values[k]);
     if (settings.isAutomatic)
         acceptAutomatic();
     if (stepKind == Regular)
@@ -415,8 +412,9 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     monitor.forcesMoved(force);
     isMonitorCurrent = true;
     if (stepKind == First) {
-        hasDensity = true;
+        hasDensity = !isCalm;
         firstDensity = 0;
+        rho = rhoNext;
     }
     if (hasDensity) {
         rho = rhoNext;
@@ -476,7 +474,37 @@ void VRattleDynamics::reverse() {
  * Where no reference value is given, rho[1/2] = 1 and it is the reference value that is chosen such that this is the
  * smooth start: no force evaluation is spent on it. Where one is given, rho[1/2] follows, and the first step is taken
  * again with it.
+ *
+ * A monitor that is zero at the start, but for rounding, asks for nothing and is no measure of what comes. As long as all are so, or
+ * one that has no reference value, steps are single ones of plain RATTLE, and the sequence of densities starts after them.
  */
+double VRattleDynamics::findFirstDensity() {
+    isCalm = false;
+    const vector<StepMonitor::Term>& terms = monitor.getTerms();
+    if (settings.isFixedStep || terms.empty())
+        return 1;
+    if (system.getFirstGeneral() < system.getNumConstraints())
+        ensureFactor(GeneralFactor); // for the Jacobian
+    double farthest = 0;
+    for (int i : movingParticles)
+        farthest = std::max(farthest, std::sqrt(q[i].dot(q[i])));
+    const double speed = std::numeric_limits<double>::epsilon() * farthest / settings.stepSize;
+    isNegligible.resize(terms.size());
+    bool areAllNegligible = true, areAllUnknown = true, areAllKnown = true;
+    for (size_t k = 0; k < terms.size(); k++) {
+        isNegligible[k] = monitor.isNegligible((int) k, values[k], v, jacobian, speed, speed / settings.stepSize);
+        areAllNegligible = areAllNegligible && isNegligible[k];
+        const bool isKnown = terms[k].reference > 0;
+        areAllUnknown = areAllUnknown && !isKnown;
+        areAllKnown = areAllKnown && isKnown;
+        isCalm = isCalm || (isNegligible[k] && !isKnown);
+    }
+    isCalm = isCalm || areAllNegligible;
+    if (areAllNegligible || areAllUnknown)
+        return 1;
+    return areAllKnown || isCalm ? combineAndLimit(values) : 1.0;
+}
+
 bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energy, vector<double>& backValues) {
     qNext.swap(qBack);
     wNext.swap(wBack);
@@ -518,16 +546,8 @@ vector<double> VRattleDynamics::evaluateHalfSteps() {
 bool VRattleDynamics::startDensityFrom(const vector<double>& startValues, const vector<double>& backValues,
                                        bool hasBack) {
     const vector<StepMonitor::Term>& terms = monitor.getTerms();
-    bool areAllTaken = true;
-    for (size_t k = 0; k < terms.size(); k++) {
-        if (terms[k].reference > 0)
-            areAllTaken = false;
-        else if (monitor.isNegligible((int) k, values[k], v, jacobian))
-            throw StepFailure(
-                "monitor " + std::to_string(k) +
-                " is zero at the first step, which is then no measure for later ones; call calibrate() or "
-                "setReferenceMonitorValue()");
-    }
+    const bool areAllTaken =
+        std::all_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return term.reference == 0; });
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].reference == 0)
             monitor.setReference((int) k,

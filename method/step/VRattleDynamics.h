@@ -291,6 +291,7 @@ private:
     [[noreturn]] void throwNotConverged(const std::vector<OpenMM::Vec3>& from,
                                         const std::vector<OpenMM::Vec3>& displacement);
 
+    double findFirstDensity();
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
     std::vector<double> evaluateHalfSteps();
     bool startDensityFrom(const std::vector<double>& startValues, const std::vector<double>& backValues, bool hasBack);
@@ -316,6 +317,8 @@ private:
     double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
     double densityOffset; // what (3.14) and (3.15) differed by in the last step
     double firstDensity; // of the first step, once it is known; else 0
+    bool isCalm; // whether the first step is one that starts no sequence
+    std::vector<char> isNegligible; // each monitor, at the first step
     std::vector<double> referencesBefore; // the first step, as long as firstDensity is known
 
     // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.

@@ -161,12 +161,12 @@ void testNegligibleMultipliers() {
     Evaluation evaluation(
         e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
     evaluation.u(e.velocities);
-    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
-    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
+    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian, 0.0, 0.0));
+    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian, 0.0, 0.0));
     e.velocities[0] = Vec3(0.3, 0.4001, 0);
     evaluation.u(e.velocities);
-    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian));
-    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian));
+    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian, 0.0, 0.0));
+    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian, 0.0, 0.0));
 }
 
 void testBounds() {
