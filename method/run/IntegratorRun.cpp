@@ -55,7 +55,7 @@ private:
 IntegratorRun::IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles,
                              unsigned long long system) :
         device(device), settings(settings), applied(settings), numParticles(numParticles), system(system),
-        areSettingsChanged(true), task(Task::Start) {
+        areSettingsChanged(true), isAtStart(false), task(Task::Start) {
     if (canTakeSettings())
         takeSettings();
 }
@@ -111,6 +111,9 @@ void IntegratorRun::takeSettings() {
     if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups() ||
         !settings.hasSameParameters(applied))
         task = Task::Start;
+    // A start has met the tolerance that there was.
+    if (isAtStart && settings.constraintTolerance != applied.constraintTolerance)
+        task = Task::Start;
     applied = settings;
     areSettingsChanged = false;
 }
@@ -147,6 +150,7 @@ void IntegratorRun::prepare(bool areForcesInvalid) {
             device.changeState();
         else if (task == Task::ChangeVelocities)
             device.changeVelocities();
+        isAtStart = isAtStart || task == Task::Start;
         task = Task::None;
     }
     catch (const StepFailure& failure) {
@@ -162,6 +166,7 @@ void IntegratorRun::askForStep(double maxTime) {
     prepare(device.updateState());
     startAutomatic();
     device.step(maxTime);
+    isAtStart = false;
     toldSize.reset();
     toldDensity.reset();
 }
@@ -179,9 +184,15 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
             toldSize = size;
             toldDensity = density;
         }
+        undoStart();
         throwFailure("the step", device.getTime(), failure.what(),
                      "; the Context is in the state before this step: use a smaller step size, or another monitor");
     }
+    catch (...) {
+        undoStart();
+        throw;
+    }
+    beforeStart.reset();
 }
 
 void IntegratorRun::step(int count) {
@@ -203,13 +214,19 @@ void IntegratorRun::stepTo(double time) {
 void IntegratorRun::reverse() {
     requireStepSize();
     prepare(false);
-    startAutomatic();
     try {
+        startAutomatic();
         device.reverse();
     }
     catch (const StepFailure& failure) {
+        undoStart();
         throwFailure("reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
     }
+    catch (...) {
+        undoStart();
+        throw;
+    }
+    beforeStart.reset();
     toldDensity.reset();
 }
 
@@ -250,6 +267,7 @@ void IntegratorRun::startAutomatic() {
     if (!settings.isAutomatic || device.hasStarted())
         return;
     const vector<double> given = device.getReferences();
+    beforeStart = BeforeStart{given, device.getStepCount()};
     if (std::any_of(given.begin(), given.end(), [](double reference) { return !(reference > 0); })) {
         vector<double> references = findAutomaticReferences(settings.calibrationSteps);
         for (size_t k = 0; k < references.size(); k++)
@@ -258,6 +276,15 @@ void IntegratorRun::startAutomatic() {
         device.setReferences(references);
     }
     startFromTrialSteps();
+}
+
+// Forget what automatic step control has started with, if the first step after that has failed or has never been tried.
+void IntegratorRun::undoStart() {
+    if (beforeStart && device.getStepCount() == beforeStart->stepCount) {
+        device.undoStartDensities();
+        device.setReferences(beforeStart->references);
+    }
+    beforeStart.reset();
 }
 
 // The geometric means of the two monitors over a trial run of fixed steps. Where steps of the nominal size fail, shorter ones

@@ -83,6 +83,7 @@ private:
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);
     void startAutomatic();
+    void undoStart();
     std::vector<double> findAutomaticReferences(int steps);
     void startFromTrialSteps();
     RunDevice& device;
@@ -91,8 +92,15 @@ private:
     const int numParticles;
     const unsigned long long system;
     bool areSettingsChanged;
+    bool isAtStart; // no step has been taken since the last start
     Task task;
     std::unique_ptr<RunState> saved; // to go on from, until it is known whether the Context is in its state
+    /** What there was before automatic step control started, as long as no step has been taken since. */
+    struct BeforeStart {
+        std::vector<double> references;
+        long long stepCount;
+    };
+    std::optional<BeforeStart> beforeStart;
     // What is to be said of the last step, where the device does not know it.
     std::optional<double> toldSize, toldDensity;
 };

@@ -166,6 +166,8 @@ public:
      * @param secondBack    U_A[-2] and U_B[-3/2]
      */
     virtual void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) = 0;
+    /** Undo startDensities(), since the step that it was for has failed; no other has been completed since. */
+    virtual void undoStartDensities() = 0;
 
     // ------------------------------------------------------------------------------------------- saving and resuming
 

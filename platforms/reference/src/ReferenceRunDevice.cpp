@@ -349,6 +349,7 @@ void ReferenceRunDevice::step(double maxTime) {
     lastStep.density = dynamics->getDensity();
     writeMoving(dynamics->getVelocities(), *data.velocities);
     ahead.reset();
+    beforeDensities.reset();
 }
 
 void ReferenceRunDevice::settle() {
@@ -470,7 +471,14 @@ double ReferenceRunDevice::densityOf(const vector<double>& values) {
 }
 
 void ReferenceRunDevice::startDensities(const vector<double>& back, const vector<double>& secondBack) {
+    beforeDensities = std::make_unique<VRattleDynamics::Kept>(dynamics->keep());
     dynamics->startAutomatic({back[0], back[1]}, {secondBack[0], secondBack[1]});
+}
+
+void ReferenceRunDevice::undoStartDensities() {
+    if (beforeDensities != nullptr)
+        dynamics->putBack(*beforeDensities);
+    beforeDensities.reset();
 }
 
 // ------------------------------------------------------------------------------------------------- saving and resuming

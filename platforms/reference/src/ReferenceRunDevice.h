@@ -51,6 +51,7 @@ public:
     double getNegligibleValue() override;
     double densityOf(const std::vector<double>& values) override;
     void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) override;
+    void undoStartDensities() override;
     void save(RunState& run) override;
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
     bool resume(const RunState& run, const IntegratorSettings& saved) override;
@@ -90,6 +91,7 @@ private:
         double time, direction;
     };
     std::unique_ptr<Trial> trial;
+    std::unique_ptr<VRattleDynamics::Kept> beforeDensities; // until a step is complete
 };
 
 } // namespace OpenMMVRattle
