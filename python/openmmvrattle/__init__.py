@@ -26,7 +26,7 @@ from .serialization import XmlSerializer
 
 if TYPE_CHECKING:
     from .compare.advice import advise
-    from .vrattle import VariableStepRattleIntegrator
+    from .integrators import VariableStepRattleIntegrator
 
 __all__ = [
     "ConstraintWarning",
@@ -86,7 +86,7 @@ def _load_compiled_part() -> list[str]:
 
     _check_openmm_version(_build.OPENMM_VERSION, openmm.version.short_version)
     from . import _vrattle
-    from .vrattle import VariableStepRattleIntegrator
+    from .integrators import VariableStepRattleIntegrator
 
     globals()["VariableStepRattleIntegrator"] = VariableStepRattleIntegrator
     # Found from the extension: in an editable install the Python files lie somewhere else.

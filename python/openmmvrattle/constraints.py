@@ -27,8 +27,10 @@ import numpy as np
 import openmm
 from openmm import unit
 
+from ._arguments import array, number
+
 if TYPE_CHECKING:
-    from .vrattle import VariableStepRattleIntegrator
+    from .integrators import VariableStepRattleIntegrator
 
 __all__ = [
     "fix_angle",
@@ -73,7 +75,7 @@ def fix_angle(
     that are to stay in a line are held by other expressions, which docs/constraints.md shows ("Molecules in a line").
     The multiplier is a torque (kJ/mol/rad).
     """
-    value = _number(angle, _ANGLE, "angle")
+    value = number(angle, "angle", _ANGLE)
     if not 0 < value < math.pi:
         raise ValueError(
             f"the angle must lie between 0 and pi, and not at these, where it has no derivative: {value} does not; "
@@ -109,7 +111,7 @@ def fix_dihedral(
         "nx = by*cz - bz*cy; ny = bz*cx - bx*cz; nz = bx*cy - by*cx;"
         "ax = x2-x1; ay = y2-y1; az = z2-z1; bx = x3-x2; by = y3-y2; bz = z3-z2; cx = x4-x3; cy = y4-y3; cz = z4-z3",
         [particle1, particle2, particle3, particle4],
-        {"angle": _number(angle, _ANGLE, "angle")},
+        {"angle": number(angle, "angle", _ANGLE)},
     )
 
 
@@ -132,7 +134,7 @@ def fix_distance_difference(
     return integrator.addConstraint(
         f"{_distance(places[0], places[1])} - {_distance(places[2], places[3])} - difference",
         particles,
-        {"difference": _number(difference, _LENGTH, "difference")},
+        {"difference": number(difference, "difference", _LENGTH)},
     )
 
 
@@ -235,27 +237,15 @@ def _distance(first: int, second: int) -> str:
     return "sqrt(" + " + ".join(f"({axis}{first}-{axis}{second})^2" for axis in "xyz") + ")"
 
 
-def _number(value: float | unit.Quantity, target: unit.Unit, name: str) -> float:
-    if unit.is_quantity(value):
-        if not value.unit.is_compatible(target):
-            raise TypeError(f"{name} must be in {target.get_name()}s, not in {value.unit.get_name()}")
-        value = value.value_in_unit(target)
-    return float(value)
-
-
 def _positive(value: float | unit.Quantity, name: str) -> float:
-    number = _number(value, _LENGTH, name)
-    if not number > 0:
-        raise ValueError(f"the {name} must be positive, not {number}")
-    return number
+    length = number(value, name, _LENGTH)
+    if not length > 0:
+        raise ValueError(f"the {name} must be positive, not {length}")
+    return length
 
 
 def _vector(value: Sequence[float] | unit.Quantity, target: unit.Unit, name: str) -> np.ndarray:
-    if unit.is_quantity(value):
-        if not value.unit.is_compatible(target):
-            raise TypeError(f"{name} must be in {target.get_name()}s, not in {value.unit.get_name()}")
-        value = value.value_in_unit(target)
-    vector = np.array([_number(x, target, name) for x in value])
+    vector = array(value, name, target)
     if vector.shape != (3,):
         raise ValueError(f"{name} must have three components, not {len(vector)}")
     return vector

@@ -32,6 +32,7 @@ from typing import IO, Any
 import openmm
 from openmm import app, unit
 
+from ._arguments import plain
 from ._constraint_errors import ConstraintErrors, expressions_of
 from .custom import CustomVariableStepRattleIntegrator
 from .custom.settings import MONITOR_KINDS
@@ -175,7 +176,7 @@ class StepSizeReporter:
     def _row(self, simulation: app.Simulation, state: openmm.State) -> dict[str, float]:
         """The values of one report by heading; what the integrator does not have is left out."""
         integrator = _integrator_of(simulation)
-        step, time = int(simulation.currentStep), _plain(state.getTime(), unit.picosecond)
+        step, time = int(simulation.currentStep), plain(state.getTime(), unit.picosecond)
         row: dict[str, float | None] = {
             "Step": step,
             "Time (ps)": time,
@@ -209,7 +210,7 @@ class StepSizeReporter:
         if self._constraint_errors is None:
             self._constraint_errors = ConstraintErrors(system)
         self._constraint_errors.update(expressions_of(integrator))
-        return self._constraint_errors.largest(_plain(state.getPositions(asNumpy=True), unit.nanometer))
+        return self._constraint_errors.largest(plain(state.getPositions(asNumpy=True), unit.nanometer))
 
     def to_dataframe(self) -> Any:
         """Get the reports so far as a pandas DataFrame, from memory or from the file.
@@ -255,7 +256,7 @@ def run_for_time(
     length = _positive(duration, "duration")
     interval = length if every is None else min(_positive(every, "time between reports"), length)
     context = simulation.context
-    start = _plain(context.getTime(), unit.picosecond)
+    start = plain(context.getTime(), unit.picosecond)
     # A last interval that is short by nothing but rounding is a whole one.
     count = max(1, math.ceil(length / interval * (1.0 - 1e-9)))
     integrator = _integrator_of(simulation)
@@ -282,18 +283,18 @@ def _advance_by_time(integrator: Any, context: openmm.Context, time: float) -> N
     largest = _called(integrator, "getMaximumStepSize")
     if largest:
         # A few steps at a time as far as they cannot lead beyond, to give Python a chance to respond to Ctrl-C.
-        while time - _plain(context.getTime(), unit.picosecond) > 30.0 * largest:
+        while time - plain(context.getTime(), unit.picosecond) > 30.0 * largest:
             integrator.step(10)
     integrator.stepTo(time)
 
 
 def _advance_by_steps(integrator: Any, context: openmm.Context, time: float) -> None:
-    now = _plain(context.getTime(), unit.picosecond)
+    now = plain(context.getTime(), unit.picosecond)
     steps = _whole_steps(integrator, time - now)
     while steps > 0:
         integrator.step(min(10, steps))
         steps -= 10
-    reached = _plain(context.getTime(), unit.picosecond)
+    reached = plain(context.getTime(), unit.picosecond)
     if abs(reached - time) > 1e-6 * (time - now):
         name = type(integrator).__name__
         raise ValueError(f"{name} has no stepTo and does not take fixed steps, so it cannot be run until a given time.")
@@ -301,7 +302,7 @@ def _advance_by_steps(integrator: Any, context: openmm.Context, time: float) -> 
 
 def _whole_steps(integrator: Any, time: float) -> int:
     """The number of fixed steps in a time."""
-    size = _plain(integrator.getStepSize(), unit.picosecond)
+    size = plain(integrator.getStepSize(), unit.picosecond)
     steps = round(time / size) if size > 0.0 else 0
     if steps < 1 or abs(steps * size - time) > 1e-6 * size * max(1, steps):
         raise ValueError(
@@ -404,15 +405,11 @@ def _called(integrator: Any, name: str) -> Any:
 
 
 def _energy(state: openmm.State) -> float:
-    return _plain(state.getKineticEnergy() + state.getPotentialEnergy(), unit.kilojoule_per_mole)
-
-
-def _plain(value: Any, in_unit: unit.Unit) -> Any:
-    return value.value_in_unit(in_unit) if unit.is_quantity(value) else value
+    return plain(state.getKineticEnergy() + state.getPotentialEnergy(), unit.kilojoule_per_mole)
 
 
 def _positive(time: float | unit.Quantity, what: str) -> float:
-    value = float(_plain(time, unit.picosecond))
+    value = float(plain(time, unit.picosecond))
     if not 0.0 < value < math.inf:
         raise ValueError(f"The {what} must be a positive time, and not {value:g} ps.")
     return value

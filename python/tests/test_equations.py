@@ -60,10 +60,9 @@ def make_integrator(control: Control, tolerance: float) -> Any:
     integrator.setMinimumStepSize(control.minimum)
     integrator.setMaximumStepSize(control.maximum)
     integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, control.update))
-    integrator.setNormOrder(control.order)
     integrator.clearMonitors()
     for kind, weight, power in control.monitors:
-        integrator.addMonitor(getattr(VariableStepRattleIntegrator, kind), weight, power)
+        integrator.addMonitor(getattr(VariableStepRattleIntegrator, kind), weight, power, control.order)
     integrator.setConstraintTolerance(tolerance)
     return integrator
 

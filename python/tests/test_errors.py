@@ -25,6 +25,8 @@ from dense_reference import (
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
 
+pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
+
 BAD_SIZES = [0.0, -0.001, float("nan"), float("inf"), -float("inf")]
 
 

@@ -507,5 +507,5 @@ def test_the_constraint_error_is_that_of_expressions_too() -> None:
     assert reported(moved(1, 2, 0.003)) == pytest.approx(0.03, rel=1e-9)
     assert reported(moved(1, 0, 0.004)) == pytest.approx(0.02, rel=1e-9)  # the distance
     # With another value of a parameter.
-    integrator.setExpressionConstraintParameter(0, "r", 0.4)
+    integrator.setExpressionParameterValue(0, "r", 0.4)
     assert reported(exact) == pytest.approx((0.25 - 0.16) / (2 * 0.5) / 0.1, rel=1e-9)

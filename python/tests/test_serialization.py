@@ -20,6 +20,8 @@ from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import TestSystem, alanine_dipeptide, rigid_waters
 
+pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
+
 UPDATES = {name: getattr(VariableStepRattleIntegrator, name) for name in ("SemiExplicit", "Explicit", "Bounded")}
 STEP = 0.001
 
@@ -146,7 +148,7 @@ def test_copies_have_every_setting(way: str, name: str) -> None:
     assert settings_of(duplicate) == settings_of(integrator)
     # The copy is on its own.
     duplicate.setNominalStepSize(STEP / 2.9)
-    duplicate.setNormOrder(3)
+    duplicate.setMonitorForceGroup(4)
     assert settings_of(integrator) == settings_of(integrators_with_settings()[name])
 
 

@@ -31,6 +31,8 @@ from openmmvrattle import VariableStepRattleIntegrator
 from test_equations import check_equations, record
 from test_openmm_behaviour import rattle_as_custom_integrator
 
+pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
+
 
 def chain_with_energy_monitor() -> tuple[Model, openmm.System]:
     """The chain, and in group 31 a positive function of its end-to-end distance for ForceGroupEnergy."""

@@ -16,6 +16,8 @@ import pytest
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
 
+pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
+
 MULTIPLIER_UNIT = unit.kilojoule_per_mole / unit.nanometer**2
 PLATFORMS = ["Reference", "CPU"]
 

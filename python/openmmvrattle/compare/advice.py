@@ -38,6 +38,7 @@ import openmm
 from openmm import unit
 
 from .. import VariableStepRattleIntegrator
+from .._arguments import number
 from ..testsystems import MonitorSettings, StepControl, TestSystem
 
 __all__ = [
@@ -293,7 +294,7 @@ def advise(
     from .inputs import from_system
 
     start = from_system("system", system, positions, velocities, temperature, seed, platform)
-    size = float(step_size.value_in_unit(unit.picosecond) if unit.is_quantity(step_size) else step_size)
+    size = number(step_size, "step_size", unit.picosecond)
     return advise_on(start, size, steps, platform, constraint_tolerance, monitors, bounds, progress)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
+from .._arguments import array
 from ..testsystems import ComparisonSettings, MonitorSettings, StepControl, TestSystem, project_onto_constraints
 
 __all__ = ["CONSTRAINTS", "DEFAULT_FORCE_FIELD", "InputError", "from_pdb", "from_system", "from_xml"]
@@ -198,8 +199,8 @@ def from_system(
         steps: the number of steps of the comparison.
     """
     system, notes = _energy_conserving(system)
-    positions = _plain(positions, unit.nanometer)
-    velocities = None if velocities is None else _plain(velocities, unit.nanometer / unit.picosecond)
+    positions = array(positions, "positions", unit.nanometer)
+    velocities = None if velocities is None else array(velocities, "velocities", unit.nanometer / unit.picosecond)
     monitor = "ConstraintAndAppliedForce" if system.getNumConstraints() else "AppliedForce"
     control = StepControl(monitors=(MonitorSettings(monitor),), nominal_step_size=step_size)
     settings = ComparisonSettings(step_size * steps, steps, (control,))
@@ -296,12 +297,6 @@ def _existing(path: str | Path) -> Path:
     if not path.is_file():
         raise InputError(f"there is no file {path}.")
     return path
-
-
-def _plain(values: Any, in_unit: unit.Unit) -> np.ndarray:
-    if unit.is_quantity(values):
-        values = values.value_in_unit(in_unit)
-    return np.array([[float(x) for x in (v.value_in_unit(in_unit) if unit.is_quantity(v) else v)] for v in values])
 
 
 def _bare_topology(particles: int) -> app.Topology:

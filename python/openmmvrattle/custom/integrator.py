@@ -17,6 +17,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
+from .._arguments import integer, monitor_arguments, number
 from .program import KEPT, make_program
 from .run import Run, find_context, positions_of, redundant_constraints, vectors, velocities_of
 from .settings import (
@@ -34,8 +35,6 @@ from .settings import (
     check,
     density_of,
     error,
-    integer,
-    number,
     positive,
     step_size,
 )
@@ -145,11 +144,10 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         if monitorForceGroup is not None:
             self.setMonitorForceGroup(monitorForceGroup)
         if monitors is not None:
-            if not isinstance(monitors, (list, tuple)):
-                raise TypeError(f"monitors must be a list of kinds or (kind, weight, power) tuples, not {monitors!r}")
+            each = monitor_arguments(monitors)
             self.clearMonitors()
-            for monitor in monitors:
-                self.addMonitor(*(monitor if isinstance(monitor, (list, tuple)) else (monitor,)))
+            for arguments in each:
+                self.addMonitor(*arguments)
         if updateMethod is not None:
             self.setUpdateMethod(updateMethod)
         if referenceMonitorValue is not None:
@@ -234,7 +232,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             raise error(f"there is no update method {settings.update}: take SemiExplicit, Explicit or Bounded")
         self._rebuild(settings)
 
-    def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0) -> int:
+    def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0, order: float = 0.0) -> int:
         """Add a monitor, before there is a Context. Several are combined as in VariableStepRattleIntegrator.
 
         Parameters
@@ -246,6 +244,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             its positive weight in the combination
         power : float
             the positive power to which U/U_ref is raised
+        order : float
+            the order p, at least 1, of ForcePNorm, the same for all of them; 0 stands for getNormOrder(), which is 8
 
         Returns
         -------
@@ -261,6 +261,11 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             raise error(f"the monitor {name} {REFUSED_MONITORS[name]}, or {INSTEAD}")
         weight = positive(number(weight, "weight"), "the weight of a monitor")
         power = positive(number(power, "power"), "the power of a monitor")
+        order = number(order, "order")
+        if order != 0 and MONITOR_KINDS[kind] == "ForcePNorm":
+            if settings.uses("ForcePNorm") and order != settings.order:
+                raise error(f"all monitors ForcePNorm have one order, which is {settings.order:g}; or use {INSTEAD}")
+            settings.order = _norm_order(order)
         settings.monitors.append(Monitor(kind, weight, power))
         self._rebuild(settings)
         return len(settings.monitors) - 1
@@ -307,10 +312,13 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
     def setNormOrder(self, order: float) -> None:
         """Set the order p of the monitor ForcePNorm, at least 1. Default: 8."""
         settings = self._settings()
-        settings.order = number(order, "order")
-        if not (math.isfinite(settings.order) and settings.order >= 1):
-            raise error(f"the order of a norm must be at least 1, not {settings.order:g}")
+        settings.order = _norm_order(number(order, "order"))
         self._change(settings)
+
+    def getMonitorNormOrder(self, index: int) -> float:
+        """Get the order p of a monitor, which is that of a norm if it is ForcePNorm."""
+        self._monitor_index(index)
+        return self.getNormOrder()
 
     def getReferenceMonitorValue(self, index: int = 0) -> float:
         """Get the reference value of a monitor: the value in force, 0 if none was set and the monitor has been zero in
@@ -896,6 +904,12 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             f"the Context is in the state after step {context.getStepCount():,}, the last one whose constraints are "
             "known to have been met"
         )
+
+
+def _norm_order(order: float) -> float:
+    if not (math.isfinite(order) and order >= 1):
+        raise error(f"the order of a norm must be at least 1, not {order:g}")
+    return order
 
 
 def _signed(groups: int) -> int:

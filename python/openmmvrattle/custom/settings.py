@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass, field
 
 import openmm
 from openmm import unit
+
+from .._arguments import number
 
 PREFIX = "vrattle_"
 VERSION = 2
@@ -204,29 +205,6 @@ def check(settings: Settings) -> None:
 
 def error(message: str) -> openmm.OpenMMException:
     return openmm.OpenMMException(f"CustomVariableStepRattleIntegrator: {message}")
-
-
-def number(value: object, name: str, target: unit.Unit = unit.dimensionless) -> float:
-    """A number or a Quantity as a number in the unit `target`."""
-    wanted = "a plain number" if target is unit.dimensionless else f"a number or a Quantity in {target.get_name()}s"
-    if unit.is_quantity(value):
-        if not value.unit.is_compatible(target):
-            raise TypeError(f"{name} must be {wanted}, not a Quantity in {value.unit.get_name()}")
-        value = value.value_in_unit(target)
-    try:
-        if isinstance(value, (str, bytes)):  # float() would read these
-            raise TypeError
-        return float(value)
-    except TypeError:
-        raise TypeError(f"{name} must be {wanted}, not {value!r}") from None
-
-
-def integer(value: object, name: str) -> int:
-    """`value` as an int, if it is an integer of any kind."""
-    try:
-        return operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name} must be an integer, not {value!r}") from None
 
 
 def positive(value: float, name: str, unit_name: str = "") -> float:

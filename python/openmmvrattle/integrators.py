@@ -1,0 +1,1023 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The integrators that are compiled, as Python sees them: units, documentation, copies.
+
+The compiled classes are in the module vrattle, which SWIG makes from the C++ headers and which takes plain numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import openmm
+from openmm import unit
+
+from . import vrattle
+from ._arguments import constraint_arguments, integer, monitor_arguments, number, parameter
+
+__all__ = ["VariableStepRattleIntegrator"]
+
+_TIME = unit.picosecond
+_MULTIPLIER = unit.kilojoule_per_mole / unit.nanometer**2
+
+
+def _deprecated(name: str, instead: str) -> None:
+    warnings.warn(f"{name} is deprecated: use {instead}", DeprecationWarning, stacklevel=3)
+
+
+class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
+    """An integrator for molecular dynamics with constraints: steps of variable size that are time-reversible.
+
+    So the energy error stays bounded over long runs. It is the method VRATTLE of E. Barth, B. Leimkuhler and S. Reich,
+    'A time-reversible variable-stepsize integrator for constrained dynamics' (SIAM J. Sci. Comput. 21, 1999); equation
+    numbers below are that paper's.
+
+    A monitor U(q,p) measures how hard the motion is to follow at the moment. The step density rho follows it by a
+    symmetric recursion, by default (3.14),
+
+        rho[n+1/2] + rho[n-1/2] = u(q[n],p[n+1/2]) + u(q[n],p[n-1/2]),      u = B(U/U_ref),
+
+    and the size of the step is stepSize/rho. stepSize is thus the step that is taken where U has its reference value
+    U_ref (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The
+    default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
+
+    For most uses let the integrator choose its steps without a monitor of yours: automatic=True in the constructor, or
+    useAutomaticStepControl().
+
+    Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are
+    solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the
+    tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
+    getMultipliers().
+
+    The velocities in the Context belong to the same time as the positions, and satisfy the velocity constraints:
+    kinetic plus potential energy of a State is the energy at that time.
+
+    A step that cannot be completed raises an OpenMMException and leaves the Context in the state before that step.
+
+    OpenMM's XmlSerializer stores all settings; copies and pickles have the settings too, and no Context. Checkpoints,
+    and States made with integratorParameters=True, store the settings and everything else that the next step depends
+    on, and loading one brings all of it back, the settings as well: a run that goes on from a checkpoint is the same to
+    the last bit on the Reference platform, and from a State to rounding. At the first step after that the forces are
+    computed once more. If they are not those of the saved run, because a Force has been changed in the meantime, or if
+    a State's positions or velocities are not the Context's (they were wrapped into the periodic box, say), the run
+    starts afresh with the saved reference values.
+
+    OpenMM's own functions that return an integrator, openmm.XmlSerializer.deserialize() and
+    CompoundIntegrator.getIntegrator(), return one of ours as a bare openmm.Integrator; cast() makes it a
+    VariableStepRattleIntegrator, and openmmvrattle.XmlSerializer does so by itself.
+
+    Drude particles are refused, for they need an integrator that keeps them at their energy minimum or at a temperature
+    of their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter
+    of OpenMM's RPMDIntegrator, which takes the place of this one.
+
+    Update methods, for setUpdateMethod(). All are symmetric in time.
+
+     - SemiExplicit (3.14): rho + rho' = u(q,p+) + u(q,p-), solved together with the constraints. The default.
+     - Explicit (3.15): rho + rho' = 2 u(q,p), known before the constraints are solved.
+     - Bounded: f(rho) + f(rho') = 2 f(u(q,p)) with f(rho) = (rho-a) - (1-a)^2/(rho-a) and a = nominal/maximum step:
+       every step stays strictly below the maximum step size and no density is ever zero or negative.
+
+    Kinds of monitor, for addMonitor(). F is the applied force, v the velocity, m the mass, K = G M^-1 G^T.
+
+     - ConstraintMultipliers: U2 (4.4), the Euclidean norm of the multipliers Lambda(q,p), in kJ/mol/nm^2.
+     - ConstraintForce: the mass-weighted constraint force sqrt(Lambda^T K Lambda) of Gauss's principle, in nm
+       amu^(1/2)/ps^2.
+     - AppliedForce: the mass-weighted applied force sqrt(sum |F|^2/m), in nm amu^(1/2)/ps^2.
+     - ConstraintAndAppliedForce: sqrt(Lambda^T K Lambda + sum |F|^2/m), in nm amu^(1/2)/ps^2.
+     - MultiplierPNorm: the p-norm of the multipliers, in kJ/mol/nm^2; see addMonitor().
+     - ForcePNorm: the p-norm over the particles of |F|, in kJ/mol/nm; see addMonitor().
+     - VectorField: U1 (4.1), sqrt(sum m |v|^2 + sum |F|^2), in OpenMM's units.
+     - MaxForce: the largest |F| of any particle, in kJ/mol/nm.
+     - ArcLength: the speed along the unconstrained trajectory in phase space, sqrt(sum |v|^2 + sum |F|^2).
+     - MaxParticleArcLength: the largest sqrt(|v|^2 + |F|^2) of any particle.
+     - ForceGroupEnergy: the potential energy of one force group, in kJ/mol; see setMonitorForceGroup().
+
+    Wrong values raise an openmm.OpenMMException; arguments of a wrong type or unit raise a TypeError.
+    """
+
+    this: Any  # what SWIG keeps the C++ object in
+    SemiExplicit: int = vrattle.VariableStepRattleIntegrator.SemiExplicit
+    Explicit: int = vrattle.VariableStepRattleIntegrator.Explicit
+    Bounded: int = vrattle.VariableStepRattleIntegrator.Bounded
+    ConstraintMultipliers: int = vrattle.VariableStepRattleIntegrator.ConstraintMultipliers
+    ConstraintForce: int = vrattle.VariableStepRattleIntegrator.ConstraintForce
+    AppliedForce: int = vrattle.VariableStepRattleIntegrator.AppliedForce
+    ConstraintAndAppliedForce: int = vrattle.VariableStepRattleIntegrator.ConstraintAndAppliedForce
+    MultiplierPNorm: int = vrattle.VariableStepRattleIntegrator.MultiplierPNorm
+    ForcePNorm: int = vrattle.VariableStepRattleIntegrator.ForcePNorm
+    VectorField: int = vrattle.VariableStepRattleIntegrator.VectorField
+    MaxForce: int = vrattle.VariableStepRattleIntegrator.MaxForce
+    ArcLength: int = vrattle.VariableStepRattleIntegrator.ArcLength
+    MaxParticleArcLength: int = vrattle.VariableStepRattleIntegrator.MaxParticleArcLength
+    ForceGroupEnergy: int = vrattle.VariableStepRattleIntegrator.ForceGroupEnergy
+
+    def __init__(
+        self,
+        stepSize: float | unit.Quantity,
+        updateMethod: int | None = None,
+        minimumStepSize: float | unit.Quantity | None = None,
+        maximumStepSize: float | unit.Quantity | None = None,
+        constraintTolerance: float | None = None,
+        monitors: Sequence[int | tuple[int, float, float] | tuple[int, float, float, float]] | None = None,
+        referenceMonitorValue: float | None = None,
+        normOrder: float | None = None,
+        monitorForceGroup: int | None = None,
+        automatic: bool | None = None,
+    ) -> None:
+        """Create a VariableStepRattleIntegrator.
+
+        Apart from stepSize, every argument can be set later by the method of the same name, and None leaves its
+        default.
+
+        Parameters
+        ----------
+        stepSize : float or Quantity
+            the nominal step size, taken where the monitor has its reference value (in ps)
+        updateMethod : int
+            the recursion of the step density: SemiExplicit (the default), Explicit or Bounded
+        minimumStepSize : float or Quantity
+            the smallest step size the monitor can ask for (in ps); 0 means no bound. Default: 1/50 of stepSize
+        maximumStepSize : float or Quantity
+            the largest step size the monitor can ask for (in ps); 0 means no bound. Default: twice stepSize
+        constraintTolerance : float
+            the relative tolerance of the constraints, see setConstraintTolerance(). Default: 1e-8
+        monitors : list
+            the monitors in place of the default one, ConstraintMultipliers: each a kind, or a tuple (kind, weight,
+            power) or (kind, weight, power, order). The empty list means fixed steps: plain RATTLE
+        referenceMonitorValue : float
+            the value of the first monitor at which the nominal step is taken; 0 (the default) means that it is taken at
+            the first step
+        normOrder : float
+            the order p of the monitors MultiplierPNorm and ForcePNorm that have none of their own. Default: 8
+        monitorForceGroup : int
+            the force group whose energy is the monitor ForceGroupEnergy. Default: 31
+        automatic : bool
+            whether the integrator chooses its steps by itself, see useAutomaticStepControl(); then updateMethod,
+            minimumStepSize, maximumStepSize, monitors and referenceMonitorValue must not be given
+
+        Raises
+        ------
+        ValueError
+            if automatic is True and one of the arguments is given that it takes the place of
+        """
+        if automatic not in (None, True, False):
+            raise TypeError(f"automatic must be True or False, not {automatic!r}")
+        excluded = {
+            "updateMethod": updateMethod,
+            "minimumStepSize": minimumStepSize,
+            "maximumStepSize": maximumStepSize,
+            "monitors": monitors,
+            "referenceMonitorValue": referenceMonitorValue,
+        }
+        for name, value in excluded.items():
+            if automatic and value is not None:
+                raise ValueError(f"automatic step control takes the place of {name}; give one of the two")
+        super().__init__(number(stepSize, "stepSize", _TIME))
+        if updateMethod is not None:
+            self.setUpdateMethod(updateMethod)
+        if minimumStepSize is not None:
+            self.setMinimumStepSize(minimumStepSize)
+        if maximumStepSize is not None:
+            self.setMaximumStepSize(maximumStepSize)
+        if constraintTolerance is not None:
+            self.setConstraintTolerance(constraintTolerance)
+        if normOrder is not None:
+            super().setNormOrder(number(normOrder, "normOrder"))
+        if monitorForceGroup is not None:
+            self.setMonitorForceGroup(monitorForceGroup)
+        if monitors is not None:
+            each = monitor_arguments(monitors)
+            self.clearMonitors()
+            for arguments in each:
+                self.addMonitor(*arguments)
+        if referenceMonitorValue is not None:
+            self.setReferenceMonitorValue(referenceMonitorValue)
+        if automatic:
+            self.useAutomaticStepControl()
+
+    def getNominalStepSize(self) -> unit.Quantity:
+        """Get the nominal step size: the step taken where the monitor has its reference value.
+
+        Returns
+        -------
+        Quantity
+            the nominal step size in picoseconds
+        """
+        return unit.Quantity(super().getNominalStepSize(), _TIME)
+
+    def setNominalStepSize(self, size: float | unit.Quantity) -> None:
+        """Set the nominal step size: the step taken where the monitor has its reference value.
+
+        In the course of a run the density is kept, so the steps change in proportion.
+
+        Parameters
+        ----------
+        size : float or Quantity
+            the nominal step size (in ps): positive, and between the step bounds where these have been set
+
+        Raises
+        ------
+        OpenMMException
+            if size is not a positive finite number between the step bounds
+        """
+        super().setNominalStepSize(number(size, "size", _TIME))
+
+    def getStepSize(self) -> unit.Quantity:
+        """Get the size of the most recent step, or the nominal step size before the first step.
+
+        Returns
+        -------
+        Quantity
+            the step size in picoseconds
+        """
+        return unit.Quantity(super().getStepSize(), _TIME)
+
+    def setStepSize(self, size: float | unit.Quantity) -> None:
+        """The same as setNominalStepSize(), so that scripts written for a fixed step keep working.
+
+        Parameters
+        ----------
+        size : float or Quantity
+            the nominal step size (in ps): positive, and between the step bounds where these have been set
+
+        Raises
+        ------
+        OpenMMException
+            if size is not a positive finite number between the step bounds
+        """
+        super().setStepSize(number(size, "size", _TIME))
+
+    def getMinimumStepSize(self) -> unit.Quantity:
+        """Get the smallest step size the monitor can ask for.
+
+        Returns
+        -------
+        Quantity
+            the bound in picoseconds, 0 if there is none
+        """
+        return unit.Quantity(super().getMinimumStepSize(), _TIME)
+
+    def setMinimumStepSize(self, size: float | unit.Quantity) -> None:
+        """Set the smallest step size the monitor can ask for.
+
+        With the sum updates SemiExplicit and Explicit, rho oscillates slightly about u and steps may leave the bounds
+        by as much; where the motion is not resolved they may leave them by more. Default: 1/50 of the nominal step
+        size.
+
+        Parameters
+        ----------
+        size : float or Quantity
+            the bound (in ps), smaller than the nominal step size; 0 means no bound
+
+        Raises
+        ------
+        OpenMMException
+            if size is negative, not finite, or not smaller than the nominal step size
+        """
+        super().setMinimumStepSize(number(size, "size", _TIME))
+
+    def getMaximumStepSize(self) -> unit.Quantity:
+        """Get the largest step size the monitor can ask for.
+
+        Returns
+        -------
+        Quantity
+            the bound in picoseconds, 0 if there is none
+        """
+        return unit.Quantity(super().getMaximumStepSize(), _TIME)
+
+    def setMaximumStepSize(self, size: float | unit.Quantity) -> None:
+        """Set the largest step size the monitor can ask for; see setMinimumStepSize().
+
+        With the update Bounded no step is ever larger, with the others a step of more than twice the bound is rescued
+        (see getNumRescues()). Default: twice the nominal step size.
+
+        Parameters
+        ----------
+        size : float or Quantity
+            the bound (in ps), larger than the nominal step size; 0 means no bound
+
+        Raises
+        ------
+        OpenMMException
+            if size is not finite, or neither 0 nor larger than the nominal step size
+        """
+        super().setMaximumStepSize(number(size, "size", _TIME))
+
+    def getUpdateMethod(self) -> int:
+        """Get the recursion of the step density.
+
+        Returns
+        -------
+        int
+            SemiExplicit, Explicit or Bounded
+        """
+        return super().getUpdateMethod()
+
+    def setUpdateMethod(self, method: int) -> None:
+        """Set the recursion of the step density.
+
+        Parameters
+        ----------
+        method : int
+            SemiExplicit (the default), Explicit or Bounded
+
+        Raises
+        ------
+        OpenMMException
+            if there is no such method
+        """
+        super().setUpdateMethod(integer(method, "method"))
+
+    def addMonitor(self, kind: int, weight: float = 1.0, power: float = 1.0, order: float = 0.0) -> int:
+        """Add a monitor.
+
+        Several monitors are combined, each relative to its own reference value, as u = sqrt(sum_k (w_k
+        (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2).
+
+        Parameters
+        ----------
+        kind : int
+            what the monitor measures: one of the constants in the description of this class
+        weight : float
+            its weight w_k > 0 in the combination; of no effect on a single monitor
+        power : float
+            the positive power to which U_k/U_k,ref is raised
+        order : float
+            the order p, at least 1, of MultiplierPNorm and ForcePNorm; of no meaning to others. 0 stands for
+            getNormOrder(), which is 8
+
+        Returns
+        -------
+        int
+            the index of the monitor
+
+        Raises
+        ------
+        OpenMMException
+            if there is no such kind, or weight or power is not a positive finite number, or order is below 1
+        """
+        return super().addMonitor(
+            integer(kind, "kind"), number(weight, "weight"), number(power, "power"), number(order, "order")
+        )
+
+    def getMonitorNormOrder(self, index: int) -> float:
+        """Get the order p of a monitor, which is that of a norm if it is MultiplierPNorm or ForcePNorm.
+
+        Parameters
+        ----------
+        index : int
+            the index of the monitor
+
+        Returns
+        -------
+        float
+            the order
+        """
+        return super().getMonitorNormOrder(integer(index, "index"))
+
+    def clearMonitors(self) -> None:
+        """Remove all monitors. With none the step is fixed at the nominal size: plain RATTLE (3.1-3.5)."""
+        super().clearMonitors()
+
+    def getNumMonitors(self) -> int:
+        """Get the number of monitors.
+
+        Returns
+        -------
+        int
+            the number of monitors
+        """
+        return super().getNumMonitors()
+
+    def getMonitor(self, index: int) -> tuple[int, float, float]:
+        """Get the settings of a monitor.
+
+        Parameters
+        ----------
+        index : int
+            the index of the monitor
+
+        Returns
+        -------
+        tuple
+            (kind, weight, power): what the monitor measures, its weight in the combination, and the power to which it
+            is raised
+
+        Raises
+        ------
+        OpenMMException
+            if there is no monitor with this index
+        """
+        return tuple(super().getMonitor(integer(index, "index")))
+
+    def getMonitorForceGroup(self) -> int:
+        """Get the force group whose energy the monitor ForceGroupEnergy uses.
+
+        Returns
+        -------
+        int
+            the force group
+        """
+        return super().getMonitorForceGroup()
+
+    def setMonitorForceGroup(self, group: int) -> None:
+        """Set the force group whose potential energy is the monitor ForceGroupEnergy: a positive function of the
+        positions that is written as an OpenMM Force.
+
+        While such a monitor exists, the group is left out of the dynamics.
+
+        Parameters
+        ----------
+        group : int
+            the force group, between 0 and 31. Default: 31
+
+        Raises
+        ------
+        OpenMMException
+            if group does not lie between 0 and 31
+        """
+        super().setMonitorForceGroup(integer(group, "group"))
+
+    def useAutomaticStepControl(self, calibrationSteps: int = 300) -> None:
+        """Let the integrator choose its steps by itself: the setting for most uses.
+
+        It takes steps of the nominal size while nothing out of the ordinary happens, and shorter ones when something
+        does, by two monitors of its own (docs/automatic.md):
+
+         - 0, U_A, on each step: the size of the constraint and applied forces of the hardest clusters of particles, and
+           of the forces times the squared speeds, in nm amu^(1/2)/ps^2;
+         - 1, U_B, of each step between: from the change of the forces along it, the second time derivative of the
+           potential energy, in the same unit.
+
+        They take the place of the monitors, which are removed, and of the update and the bounds, which have no effect
+        then: no step is ever larger than 4/3 of the nominal one. clearMonitors() and addMonitor() end it.
+        getMonitorValue(), getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
+
+        The first step is preceded by a trial run of fixed steps of the nominal size from the state at that time, which
+        leaves the Context as it was. The geometric means of the monitors over it become their reference values, unless
+        these have been set. They stay in force when the state is changed later; calling this again, or calibrate(),
+        takes new ones. Take them where the forces are typical: a reference value that is too small makes steps shorter
+        than they need be. Each start, also after positions, velocities or parameters have been changed, takes two trial
+        steps more. All trial steps count as evaluations of the forces.
+
+        Parameters
+        ----------
+        calibrationSteps : int
+            the number of trial steps, at least 1
+
+        Raises
+        ------
+        OpenMMException
+            if calibrationSteps is not positive
+        """
+        super().useAutomaticStepControl(integer(calibrationSteps, "calibrationSteps"))
+
+    def isAutomatic(self) -> bool:
+        """Get whether the automatic step control is in use.
+
+        Returns
+        -------
+        bool
+            whether useAutomaticStepControl() was called, and neither clearMonitors() nor addMonitor() since
+        """
+        return super().isAutomatic()
+
+    def getCalibrationSteps(self) -> int:
+        """Get the number of trial steps of the automatic step control, as it was set last.
+
+        Returns
+        -------
+        int
+            the number of trial steps
+        """
+        return super().getCalibrationSteps()
+
+    def getNormOrder(self) -> float:
+        """Get the order that addMonitor() gives to monitors that are added without one.
+
+        Deprecated: use getMonitorNormOrder().
+
+        Returns
+        -------
+        float
+            the order
+        """
+        _deprecated("getNormOrder()", "getMonitorNormOrder()")
+        return super().getNormOrder()
+
+    def setNormOrder(self, order: float) -> None:
+        """Set the order p of all monitors MultiplierPNorm and ForcePNorm, also of those that are added later without
+        one.
+
+        Deprecated: give it to addMonitor().
+
+        Parameters
+        ----------
+        order : float
+            the order, at least 1. Default: 8
+
+        Raises
+        ------
+        OpenMMException
+            if order is not a finite number of at least 1
+        """
+        _deprecated("setNormOrder()", "the argument order of addMonitor()")
+        super().setNormOrder(number(order, "order"))
+
+    def getReferenceMonitorValue(self, index: int = 0) -> float:
+        """Get the reference value U_ref of a monitor: where U equals it, the nominal step size is taken.
+
+        Parameters
+        ----------
+        index : int
+            the index of the monitor
+
+        Returns
+        -------
+        float
+            the value in force, in the monitor's unit; 0 if none was set and no step has been taken
+
+        Raises
+        ------
+        OpenMMException
+            if there is no monitor with this index
+        """
+        return super().getReferenceMonitorValue(integer(index, "index"))
+
+    def setReferenceMonitorValue(self, value: float, index: int = 0) -> None:
+        """Set the reference value U_ref of a monitor. 0 (the default) means that it is taken at the first step: the
+        first step then has the nominal size, and U_ref is the value of U that makes the sequence of densities start
+        without oscillation, which is U at the start up to the change of U over a half step.
+
+        Parameters
+        ----------
+        value : float
+            the reference value in the monitor's unit, or 0
+        index : int
+            the index of the monitor
+
+        Raises
+        ------
+        OpenMMException
+            if value is negative or not finite, or there is no monitor with this index
+        """
+        super().setReferenceMonitorValue(number(value, "value"), integer(index, "index"))
+
+    def calibrate(self, steps: int) -> None:
+        """Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size.
+
+        The trial run starts at the current state of the Context, and everything but the reference values and the number
+        of force evaluations is put back as it was.
+
+        Parameters
+        ----------
+        steps : int
+            the number of trial steps
+
+        Raises
+        ------
+        OpenMMException
+            if steps is not positive, there is no monitor, there is no Context, or a trial step fails
+        """
+        super().calibrate(integer(steps, "steps"))
+
+    def setVelocitiesToTemperature(self, temperature: float | unit.Quantity, randomSeed: int | None = None) -> None:
+        """Give the particles of the Context random velocities of a temperature that satisfy all constraints.
+
+        Those given as expressions too: each velocity is drawn from Maxwell's distribution, and all together are
+        projected onto the constraints in the metric of the masses, so that the mean kinetic energy is kT/2 for each
+        degree of freedom that the constraints leave. It does what setVelocitiesToTemperature() of the Context does,
+        whose solver leaves expressions alone and can fail where constraints are strongly coupled.
+
+        Where the positions do not satisfy the constraints, the velocities satisfy them at the positions that the next
+        step starts from. The forces are computed once, for that step.
+
+        Parameters
+        ----------
+        temperature : float or Quantity
+            the temperature (in K); not negative
+        randomSeed : int
+            the same seed gives the same velocities. Default: another one at each call
+
+        Raises
+        ------
+        OpenMMException
+            if the temperature is negative or not finite, there is no Context, or its positions are no start for a run;
+            the velocities are then as before
+        """
+        seed = () if randomSeed is None else (integer(randomSeed, "randomSeed"),)
+        super().setVelocitiesToTemperature(number(temperature, "temperature", unit.kelvin), *seed)
+
+    def getStepDensity(self) -> float:
+        """Get the step density rho of the last step; 1 before the first step.
+
+        Returns
+        -------
+        float
+            the step density
+        """
+        return super().getStepDensity()
+
+    def getMonitorValue(self, index: int = 0) -> float:
+        """Get the value U_k(q,p) of a monitor at the current positions and velocities.
+
+        Before the first step this computes the forces. With automatic step control monitor 1 is that of the last step,
+        and 0 before the first one.
+
+        Parameters
+        ----------
+        index : int
+            the index of the monitor
+
+        Returns
+        -------
+        float
+            the value, in the unit given with the monitor's kind
+
+        Raises
+        ------
+        OpenMMException
+            if there is no monitor with this index, or no Context
+        """
+        return super().getMonitorValue(integer(index, "index"))
+
+    def getMultipliers(self) -> unit.Quantity:
+        """Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in
+        the order of the System's constraints, and behind them those of addConstraint().
+
+        The force of constraint k of the System, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle i and
+        the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d. The force of
+        any constraint g = 0 on a particle is -Lambda_k dg/dq. Before the first step this computes the forces.
+
+        Returns
+        -------
+        Quantity
+            a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles. Those of
+            addConstraint() are numbers in kJ/mol over the unit of the expression, whatever the unit of the list says;
+            see getExpressionConstraintMultiplier()
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context
+        """
+        return unit.Quantity(list(super().getMultipliers()), _MULTIPLIER)
+
+    def getExpressionConstraintMultiplier(self, index: int) -> float:
+        """Get the Lagrange multiplier of one constraint of addConstraint(); see getMultipliers().
+
+        Where the expression is a reaction coordinate minus its value, it is the force that holds the coordinate there,
+        with the sign of a force against g.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint, as addConstraint() has returned it
+
+        Returns
+        -------
+        float
+            the multiplier, in kJ/mol over the unit of the expression
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or no Context
+        """
+        return super().getExpressionConstraintMultiplier(integer(index, "index"))
+
+    def getNumExpressionConstraints(self) -> int:
+        """Get the number of constraints that addConstraint() has added.
+
+        Returns
+        -------
+        int
+            their number
+        """
+        return super().getNumExpressionConstraints()
+
+    def setExpressionParameterValue(self, index: int, name: str, value: float | unit.Quantity) -> None:
+        """Change the value of one parameter of a constraint.
+
+        It is in force at the next step, which starts the run afresh from positions that satisfy the constraint.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+        name : str
+            the name of the parameter
+        value : float or Quantity
+            its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or it has no such parameter, or the value is not finite
+        """
+        super().setExpressionParameterValue(integer(index, "index"), name, parameter(value, name))
+
+    def setExpressionConstraintParameter(self, index: int, name: str, value: float | unit.Quantity) -> None:
+        """The same as setExpressionParameterValue().
+
+        Deprecated: the name is too much like setExpressionConstraintParameters().
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+        name : str
+            the name of the parameter
+        value : float or Quantity
+            its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or it has no such parameter, or the value is not finite
+        """
+        _deprecated("setExpressionConstraintParameter()", "setExpressionParameterValue()")
+        self.setExpressionParameterValue(index, name, value)
+
+    def getNumForceEvaluations(self) -> int:
+        """Get how often the forces have been computed for this integrator since the Context was created or
+        reinitialized.
+
+        Loading a checkpoint or a State does not change this count, nor the others.
+
+        Returns
+        -------
+        int
+            the number of force evaluations
+        """
+        return super().getNumForceEvaluations()
+
+    def getNumSolverIterations(self) -> int:
+        """Get how many iterations the solver of the constraints has taken since the Context was created.
+
+        Returns
+        -------
+        int
+            the number of iterations
+        """
+        return super().getNumSolverIterations()
+
+    def getNumRescues(self) -> int:
+        """Get how many steps since the Context was created had to be rescued: the sum update gave no positive density,
+        a step of more than twice the maximum, or equations that could not be solved, and the density of the update
+        Bounded was taken for that one step.
+
+        The run goes on, but it is not exactly reversible across a rescued step. A number that grows says that the
+        nominal step size is too large.
+
+        Returns
+        -------
+        int
+            the number of rescued steps
+        """
+        return super().getNumRescues()
+
+    def setConstraintTolerance(self, tol: float) -> None:
+        """Set the relative tolerance of the constraints. Default: 1e-8.
+
+        For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of
+        0.1 nm, about the length of a bond, and the error that is compared with it is the distance of the particles from
+        where g = 0 holds, to first order: |g| over the Euclidean norm of the gradient of g with respect to the
+        particles that have mass. It is therefore the same for g and for 1000 g.
+
+        Parameters
+        ----------
+        tol : float
+            the tolerance; positive and finite
+
+        Raises
+        ------
+        OpenMMException
+            if tol is not a positive finite number
+        """
+        super().setConstraintTolerance(number(tol, "tol"))
+
+    def step(self, steps: int) -> None:
+        """Advance the simulation by a number of steps.
+
+        Parameters
+        ----------
+        steps : int
+            the number of steps to take
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context, or a step cannot be completed; the Context is then in the state before that step
+        """
+        super().step(integer(steps, "steps"))
+
+    def stepTo(self, time: float | unit.Quantity) -> None:
+        """Advance the simulation until a given time, which is met exactly by a shortened last step.
+
+        The step density goes on smoothly after it, but the shortened step is not part of the reversible sequence: to
+        retrace a run, use step(). A time earlier than the current one does nothing.
+
+        Parameters
+        ----------
+        time : float or Quantity
+            the time to which the simulation is advanced (in ps)
+
+        Raises
+        ------
+        OpenMMException
+            if time is not finite, there is no Context, or a step cannot be completed; the Context is then in the state
+            before that step
+        """
+        super().stepTo(number(time, "time", _TIME))
+
+    def reverse(self) -> None:
+        """Turn time around: the velocities change sign, and the half-step momentum and the density become those of the
+        step that would have come next, so that the following steps retrace the trajectory.
+
+        No force is computed, and the Context's time goes on forward.
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context, or the step that would have come next cannot be solved for
+        """
+        super().reverse()
+
+    def addConstraint(
+        self,
+        expression: str,
+        particles: Iterable[int],
+        parameters: Mapping[str, float | unit.Quantity] = {},
+    ) -> int:
+        """Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm,
+        which are called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters
+        of this constraint, which have names.
+
+        It has the syntax of OpenMM's custom forces: operators + - * / ^, their functions, and intermediate values
+        defined after a semicolon. Derivatives are found symbolically. Constraints that have the same expression, with
+        different particles and values of parameters, are evaluated together, which is much faster.
+
+            integrator.addConstraint("r - r0; r = sqrt((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2)", [3, 7], {"r0": 0.3})
+
+        Functions for the constraints that are asked for most are in openmmvrattle.constraints.
+
+        The gradient of g must not vanish where g = 0: a point is kept on a sphere by r - r0 or by r^2 - r0^2, but
+        not by (r - r0)^2. Coordinates are taken as they are, not as their nearest periodic images. A particle of
+        mass zero is a fixed point; at least one of the particles must have mass, and none may be a virtual site.
+
+        As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at
+        the first step. OpenMM itself knows nothing of it: Context.applyConstraints() and
+        applyVelocityConstraints() leave it alone, and a CompoundIntegrator's other integrators do not keep it. It
+        works on the platforms Reference and CPU.
+
+        A constraint that is added after the Context was created takes effect with Context.reinitialize(); until
+        then steps raise an exception.
+
+        Parameters
+        ----------
+        expression : str
+            the expression g
+        particles : list
+            the indices of the particles
+        parameters : dict
+            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
+
+        Returns
+        -------
+        int
+            the index of the constraint among those that were added
+
+        Raises
+        ------
+        OpenMMException
+            if the expression cannot be understood, contains anything but coordinates of the particles and the
+            parameters, or a particle is named twice
+        """
+        return super().addConstraint(*constraint_arguments(expression, particles, parameters))
+
+    def getExpressionConstraintParameters(self, index: int) -> tuple[str, list[int], dict[str, float]]:
+        """Get what a constraint was added with.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+
+        Returns
+        -------
+        tuple
+            the expression, the list of the particles, and the dict of the parameters, as numbers in OpenMM's units
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index
+        """
+        index = integer(index, "index")
+        expression, particles = self._getExpression(index), list(self._getExpressionParticles(index))
+        return expression, particles, dict(self._getExpressionParameters(index))
+
+    def setExpressionConstraintParameters(
+        self,
+        index: int,
+        expression: str,
+        particles: Iterable[int],
+        parameters: Mapping[str, float | unit.Quantity] = {},
+    ) -> None:
+        """Change a constraint.
+
+        New values of its parameters are in force at the next step, which starts the run afresh from positions that
+        satisfy the constraint; another expression, other particles or other names take effect with
+        Context.reinitialize(), as for addConstraint().
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+        expression : str
+            the expression
+        particles : list
+            the indices of the particles
+        parameters : dict
+            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or addConstraint() would refuse it
+        """
+        super().setExpressionConstraintParameters(
+            integer(index, "index"), *constraint_arguments(expression, particles, parameters)
+        )
+
+    @staticmethod
+    def isinstance(integrator: openmm.Integrator) -> bool:
+        """Get whether an integrator is a VariableStepRattleIntegrator, though its class may be openmm.Integrator.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            any integrator
+
+        Returns
+        -------
+        bool
+            whether cast() would take it
+        """
+        return vrattle.VariableStepRattleIntegrator._isinstance(integrator)
+
+    @staticmethod
+    def cast(integrator: openmm.Integrator) -> VariableStepRattleIntegrator:
+        """Make what OpenMM has returned as a bare openmm.Integrator a VariableStepRattleIntegrator again.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
+
+        Returns
+        -------
+        VariableStepRattleIntegrator
+            the same Python object, whose class has been changed
+
+        Raises
+        ------
+        TypeError
+            if it is an integrator of another kind
+        """
+        if isinstance(integrator, VariableStepRattleIntegrator):
+            return integrator
+        typed = vrattle.VariableStepRattleIntegrator._cast(integrator)
+        if typed is None:
+            raise TypeError(f"a {type(integrator).__name__} is not a VariableStepRattleIntegrator")
+        typed.thisown = integrator.thisown
+        integrator.thisown = False
+        integrator.this = typed.this
+        integrator.__class__ = VariableStepRattleIntegrator
+        return integrator
+
+    def _attributes(self) -> dict[str, object]:
+        """Return what Python code has attached to this integrator."""
+        return {name: value for name, value in self.__dict__.items() if name != "this"}
+
+    def __copy__(self) -> VariableStepRattleIntegrator:
+        duplicate = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.clone(self))
+        duplicate.__class__ = type(self)
+        duplicate.__dict__.update(copy.deepcopy(self._attributes()))
+        return duplicate
+
+    def __deepcopy__(self, memo: dict) -> VariableStepRattleIntegrator:
+        return self.__copy__()
+
+    def __getstate__(self) -> tuple[str, dict[str, object]]:
+        return openmm.XmlSerializer.serialize(self), self._attributes()
+
+    def __setstate__(self, state: tuple[str, dict[str, object]]) -> None:
+        xml, attributes = state
+        self.this = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.deserialize(xml)).this
+        self.__dict__.update(attributes)
