@@ -112,6 +112,32 @@ EliminationTree findEliminationTree(int size, const MatrixEntries& entries, size
     return tree;
 }
 
+namespace {
+
+vector<int> findLevels(const EliminationTree& tree) {
+    vector<int> levels(tree.parent.size(), 0);
+    for (size_t column = 0; column < levels.size(); column++)
+        if (tree.parent[column] != EliminationTree::NONE)
+            levels[tree.parent[column]] = std::max(levels[tree.parent[column]], levels[column] + 1);
+    return levels;
+}
+
+// Put an order whose tree is known into that of places, which are numbers of its columns.
+EliminationOrder arrange(const vector<int>& order, const vector<int>& levels, const vector<int>& places,
+                         int numNarrow) {
+    EliminationOrder result;
+    result.numNarrow = numNarrow;
+    result.numLevels = 0;
+    for (int place : places) {
+        result.rows.push_back(order[place]);
+        result.levels.push_back(levels[place]);
+        result.numLevels = std::max(result.numLevels, levels[place] + 1);
+    }
+    return result;
+}
+
+} // namespace
+
 EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
     vector<int> order(size);
     std::iota(order.begin(), order.end(), 0);
@@ -125,25 +151,93 @@ EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
             tree = std::move(otherTree);
         }
     }
-    vector<int> level(size, 0), places;
+    const vector<int> levels = findLevels(tree);
+    vector<int> places;
     vector<char> isWide(size);
     for (int column = 0; column < size; column++) {
         isWide[column] = isWide[column] || tree.counts[column] >= EliminationOrder::WIDE;
         if (!isWide[column])
             places.push_back(column);
         const int parent = tree.parent[column];
-        if (parent == EliminationTree::NONE)
-            continue;
-        level[parent] = std::max(level[parent], level[column] + 1);
-        isWide[parent] = isWide[parent] || isWide[column];
+        if (parent != EliminationTree::NONE)
+            isWide[parent] = isWide[parent] || isWide[column];
     }
-    std::stable_sort(places.begin(), places.end(), [&](int a, int b) { return level[a] < level[b]; });
+    std::stable_sort(places.begin(), places.end(), [&](int a, int b) { return levels[a] < levels[b]; });
     const int numNarrow = (int) places.size();
     const vector<int> wide = orderWide(tree, isWide);
     places.insert(places.end(), wide.begin(), wide.end());
-    for (int& place : places)
-        place = order[place];
-    return {places, numNarrow};
+    return arrange(order, levels, places, numNarrow);
+}
+
+EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries) {
+    const int SLACK = 2, FEW = 5;
+    vector<vector<int>> neighbours(size); // of what is left, sorted
+    for (const auto& entry : entries) {
+        neighbours[entry.first].push_back(entry.second);
+        neighbours[entry.second].push_back(entry.first);
+    }
+    auto sortUnique = [](vector<int>& list) {
+        std::sort(list.begin(), list.end());
+        list.erase(std::unique(list.begin(), list.end()), list.end());
+    };
+    vector<int> order, left(size), chosen, candidates, joined;
+    std::iota(left.begin(), left.end(), 0);
+    std::for_each(neighbours.begin(), neighbours.end(), sortUnique);
+    vector<int> blockedIn(size, -1); // the round in which a neighbour has been chosen
+    vector<char> isGone(size, false);
+    for (int round = 0; !left.empty(); round++) {
+        auto degree = [&](int row) { return neighbours[row].size(); };
+        const size_t least =
+            degree(*std::min_element(left.begin(), left.end(), [&](int a, int b) { return degree(a) < degree(b); }));
+        if (least >= (size_t) EliminationOrder::WIDE)
+            break;
+        const size_t most = std::max(std::min(least + SLACK, (size_t) FEW), least);
+        candidates.clear();
+        std::copy_if(left.begin(), left.end(), std::back_inserter(candidates),
+                     [&](int row) { return degree(row) <= most; });
+        std::stable_sort(candidates.begin(), candidates.end(), [&](int a, int b) { return degree(a) < degree(b); });
+        chosen.clear();
+        for (int row : candidates)
+            if (blockedIn[row] != round) {
+                chosen.push_back(row);
+                for (int other : neighbours[row])
+                    blockedIn[other] = round;
+            }
+        for (int row : chosen) {
+            order.push_back(row);
+            isGone[row] = true;
+            for (int other : neighbours[row]) {
+                joined.clear();
+                std::set_union(neighbours[other].begin(), neighbours[other].end(), neighbours[row].begin(),
+                               neighbours[row].end(), std::back_inserter(joined));
+                joined.erase(std::remove_if(joined.begin(), joined.end(),
+                                            [&](int each) { return each == row || each == other; }),
+                             joined.end());
+                neighbours[other].swap(joined);
+            }
+        }
+        left.erase(std::remove_if(left.begin(), left.end(), [&](int row) { return isGone[row] != 0; }), left.end());
+    }
+    if (!left.empty()) {
+        MatrixEntries rest;
+        vector<int> placeOf(size);
+        for (size_t k = 0; k < left.size(); k++)
+            placeOf[left[k]] = (int) k;
+        for (int row : left)
+            for (int other : neighbours[row])
+                if (placeOf[other] < placeOf[row])
+                    rest.emplace_back(placeOf[row], placeOf[other]);
+        for (int place : findEliminationOrder((int) left.size(), rest).rows)
+            order.push_back(left[place]);
+    }
+    const EliminationTree tree = findEliminationTree(size, reorder(entries, order));
+    const vector<int> levels = findLevels(tree);
+    vector<int> places(size);
+    std::iota(places.begin(), places.end(), 0);
+    std::stable_sort(places.begin(), places.end(), [&](int a, int b) { return levels[a] < levels[b]; });
+    const auto wide = std::find_if(places.begin(), places.end(),
+                                   [&](int place) { return tree.counts[place] >= EliminationOrder::WIDE; });
+    return arrange(order, levels, places, (int) (wide - places.begin()));
 }
 
 } // namespace OpenMMVRattle

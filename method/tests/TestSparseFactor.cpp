@@ -124,6 +124,54 @@ void testOrder(int size, const MatrixEntries& entries, bool isWide) {
     ASSERT(numSources <= tree.numEntries);
 }
 
+// Levels as they are defined: none of two columns of one level is in the other's elimination.
+static void checkLevels(int size, const MatrixEntries& entries, const EliminationOrder& order) {
+    const MatrixEntries reordered = reorder(entries, order.rows);
+    vector<std::set<int>> columns(size);
+    for (const auto& entry : reordered)
+        columns[entry.second].insert(entry.first);
+    int highest = 0;
+    for (int column = 0; column < size; column++) {
+        for (int row : columns[column]) {
+            ASSERT(order.levels[row] > order.levels[column]);
+            columns[*columns[column].begin()].insert(row);
+        }
+        if (!columns[column].empty())
+            columns[*columns[column].begin()].erase(*columns[column].begin());
+        highest = std::max(highest, order.levels[column]);
+    }
+    ASSERT_EQUAL(highest + 1, order.numLevels);
+}
+
+// Rounds of independent eliminations: few levels for little fill.
+void testRounds(int size, const MatrixEntries& entries, int maxLevels, double maxFill) {
+    const EliminationOrder order = findEliminationRounds(size, entries);
+    vector<int> sorted = order.rows;
+    std::sort(sorted.begin(), sorted.end());
+    for (int i = 0; i < size; i++)
+        ASSERT_EQUAL(i, sorted[i]);
+    checkLevels(size, entries, order);
+    checkLevels(size, entries, findEliminationOrder(size, entries));
+    ASSERT(std::is_sorted(order.levels.begin(), order.levels.end()));
+    ASSERT(order.numLevels <= maxLevels);
+    const size_t entriesOfFactor = findEliminationTree(size, reorder(entries, order.rows)).numEntries;
+    ASSERT((double) (entriesOfFactor + size) <= maxFill * (double) (entries.size() + size));
+}
+
+// The couplings of the bonds of a comb: a molecule with side groups and rings of three.
+MatrixEntries makeMolecule(int backbone, int& size) {
+    const Example e = makeComb(backbone);
+    const ConstraintSystem system(e.masses, e.distances);
+    MatrixEntries entries;
+    for (const auto& coupling : system.getCouplings()) {
+        const int row = system.getConstraintOf(coupling.row), column = system.getConstraintOf(coupling.column);
+        if (row != column)
+            entries.emplace_back(row, column);
+    }
+    size = system.getNumConstraints();
+    return entries;
+}
+
 void testFactor(int size, const MatrixEntries& given) {
     const MatrixEntries entries = reorder(given, findEliminationOrder(size, given).rows);
     const Eigen::MatrixXd matrix = makeMatrix(size, entries);
@@ -227,6 +275,16 @@ int main() {
         {"order, a chain", [] { testOrder(300, makeChain(300), false); }},
         {"order, a dense matrix", [] { testOrder(150, makeDense(150), true); }},
         {"order, a cube", [] { testOrder(1000, makeCube(10), true); }},
+        {"rounds, a chain", [] { testRounds(1500, makeChain(1500), 11, 1.6); }},
+        {"rounds, a long chain", [] { testRounds(10000, makeChain(10000), 14, 1.6); }},
+        {"rounds, a molecule",
+         [] {
+             int size;
+             const MatrixEntries entries = makeMolecule(1500, size);
+             testRounds(size, entries, 20, 1.5);
+         }},
+        {"rounds, a dense matrix", [] { testRounds(60, makeDense(60), 60, 1.0); }},
+        {"rounds, a cube", [] { testRounds(1000, makeCube(10), 400, 100); }},
         {"factor, a chain", [] { testFactor(300, makeChain(300)); }},
         {"factor, a dense matrix", [] { testFactor(150, makeDense(150)); }},
         {"factor, a cube", [] { testFactor(1000, makeCube(10)); }},
