@@ -50,7 +50,6 @@ double StepDensity::inverseOfF(double y) const {
 }
 
 double StepDensity::boundedUpdate(double u, double previous) const {
-    // A density of a sum update may lie outside the domain of f by its oscillation; 1e-3 of the distance keeps it in.
-    double margin = 1e-3 * (1 - smallest);
+    double margin = DOMAIN_MARGIN * (1 - smallest);
     return inverseOfF(2 * f(std::max(u, smallest + margin)) - f(std::max(previous, smallest + margin)));
 }

@@ -13,6 +13,8 @@ namespace OpenMMVRattle {
 class StepDensity {
 public:
     enum Update { SemiExplicit, Explicit, Bounded };
+    /** A density of a sum update may lie outside the domain of f by its oscillation; this fraction of 1 - a keeps it in. */
+    static constexpr double DOMAIN_MARGIN = 1e-3;
     StepDensity();
     /**
      * @param update     the recursion
@@ -38,6 +40,19 @@ public:
     /** Whether a density asks for a step of more than twice the maximum. */
     bool isFarBelowBound(double rho) const {
         return rho < 0.5 * smallest;
+    }
+    /** The numbers of f and B, for devices: a, and B(u) = (lower + upperSlope u)/(1 + curve u). */
+    double getSmallest() const {
+        return smallest;
+    }
+    double getLower() const {
+        return lower;
+    }
+    double getUpperSlope() const {
+        return upperSlope;
+    }
+    double getCurve() const {
+        return k;
     }
 
 private:

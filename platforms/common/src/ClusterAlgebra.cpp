@@ -1,0 +1,176 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "ClusterAlgebra.h"
+#include <algorithm>
+#include <set>
+
+using namespace OpenMMVRattle;
+using std::string;
+using std::to_string;
+using std::vector;
+
+namespace {
+
+string at(const char* array, int i) {
+    return string(array) + "[" + to_string(i) + "]";
+}
+
+string at(const char* array, int i, int j) {
+    return string(array) + to_string(i) + "_" + to_string(j);
+}
+
+} // namespace
+
+// Elimination by least degree; the entries that it fills in are found by eliminating the graph.
+ClusterAlgebra::ClusterAlgebra(const vector<std::pair<int, int>>& pairs) : pairs(pairs) {
+    const int n = (int) pairs.size();
+    vector<std::set<int>> neighbours(n);
+    for (int k = 0; k < n; k++)
+        for (int l = 0; l < n; l++)
+            if (k != l && !weight(k, l).empty())
+                neighbours[k].insert(l);
+    vector<bool> isEliminated(n, false);
+    vector<std::set<int>> columns(n);
+    for (int p = 0; p < n; p++) {
+        int next = -1;
+        for (int k = 0; k < n; k++)
+            if (!isEliminated[k] && (next < 0 || neighbours[k].size() < neighbours[next].size()))
+                next = k;
+        order.push_back(next);
+        isEliminated[next] = true;
+        columns[p] = neighbours[next];
+        for (int i : neighbours[next]) {
+            neighbours[i].erase(next);
+            for (int j : neighbours[next])
+                if (i != j)
+                    neighbours[i].insert(j);
+        }
+    }
+    entries.assign(n, vector<int>(n, -1));
+    int count = 0;
+    for (int p = 0; p < n; p++) {
+        entries[p][p] = count++;
+        for (int i = p + 1; i < n; i++)
+            if (columns[p].count(order[i]) > 0)
+                entries[i][p] = entries[p][i] = count++;
+    }
+}
+
+int ClusterAlgebra::getNumEntries() const {
+    int largest = -1;
+    for (const vector<int>& row : entries)
+        largest = std::max(largest, *std::max_element(row.begin(), row.end()));
+    return largest + 1;
+}
+
+// How much a multiplier of l moves the distance vector of k along r[l]: the sum of the inverse masses of the particles that they
+// share, with the sign of their ends; empty if there are none.
+string ClusterAlgebra::weight(int k, int l) const {
+    string sum;
+    for (int endK = 0; endK < 2; endK++)
+        for (int endL = 0; endL < 2; endL++) {
+            const int atomK = endK == 0 ? pairs[k].first : pairs[k].second;
+            const int atomL = endL == 0 ? pairs[l].first : pairs[l].second;
+            if (atomK == atomL)
+                sum += (endK == endL ? (sum.empty() ? "" : " + ") : (sum.empty() ? "-" : " - ")) + at("w", atomK);
+        }
+    return sum.empty() ? sum : "(" + sum + ")";
+}
+
+string ClusterAlgebra::lower(int i, int j) const {
+    return at("L", entries[i][j]);
+}
+
+string ClusterAlgebra::writeFactorize() const {
+    const int n = (int) pairs.size();
+    string text =
+        "inline DEVICE bool factorize_KIND(mixed (*r)[3], mixed* w, mixed* L) {\n    bool isRegular = true;\n";
+    auto product = [&](int i, int j) {
+        const string w = weight(order[i], order[j]);
+        return w.empty() ? string("0") : w + "*dot3(" + at("r", order[i]) + ", " + at("r", order[j]) + ")";
+    };
+    for (int p = 0; p < n; p++)
+        for (int i = p; i < n; i++)
+            if (isEntry(i, p))
+                text += "    " + lower(i, p) + " = " + product(i, p) + ";\n";
+    for (int p = 0; p < n; p++) {
+        text += "    isRegular = isRegular && " + lower(p, p) + " > (mixed) MIN_PIVOT*" + product(p, p) + ";\n";
+        text += "    " + lower(p, p) + " = 1/" + lower(p, p) + ";\n";
+        for (int i = n - 1; i > p; i--) { // a column's own entries are divided last
+            if (!isEntry(i, p))
+                continue;
+            text += "    {\n        const mixed f = " + lower(i, p) + "*" + lower(p, p) + ";\n";
+            for (int j = p + 1; j <= i; j++)
+                if (isEntry(j, p))
+                    text += "        " + lower(i, j) + " -= f*" + lower(j, p) + ";\n";
+            text += "        " + lower(i, p) + " = f;\n    }\n";
+        }
+    }
+    return text + "    return isRegular;\n}\n\n";
+}
+
+string ClusterAlgebra::writeSolve() const {
+    const int n = (int) pairs.size();
+    string text = "inline DEVICE void solve_KIND(mixed* L, mixed* b) {\n";
+    for (int p = 0; p < n; p++)
+        for (int i = p + 1; i < n; i++)
+            if (isEntry(i, p))
+                text += "    " + at("b", order[i]) + " -= " + lower(i, p) + "*" + at("b", order[p]) + ";\n";
+    for (int p = n - 1; p >= 0; p--) {
+        text += "    " + at("b", order[p]) + " *= " + lower(p, p) + ";\n";
+        for (int i = p + 1; i < n; i++)
+            if (isEntry(i, p))
+                text += "    " + at("b", order[p]) + " -= " + lower(i, p) + "*" + at("b", order[i]) + ";\n";
+    }
+    return text + "}\n\n";
+}
+
+string ClusterAlgebra::writeNewton() const {
+    const int n = (int) pairs.size();
+    string text = "inline DEVICE void newton_KIND(mixed (*s)[3], mixed (*r)[3], mixed* w, mixed* b) {\n";
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < n; j++)
+            if (isEntry(i, j)) {
+                const string w = weight(order[i], order[j]);
+                text += "    mixed " + at("A", i, j) + " = " +
+                        (w.empty() ? string("0") : w + "*dot3(" + at("s", order[i]) + ", " + at("r", order[j]) + ")") +
+                        ";\n";
+            }
+    for (int p = 0; p < n; p++) {
+        text += "    " + at("A", p, p) + " = 1/" + at("A", p, p) + ";\n";
+        for (int i = p + 1; i < n; i++) {
+            if (!isEntry(i, p))
+                continue;
+            text += "    {\n        const mixed f = " + at("A", i, p) + "*" + at("A", p, p) + ";\n";
+            for (int j = p + 1; j < n; j++)
+                if (isEntry(p, j))
+                    text += "        " + at("A", i, j) + " -= f*" + at("A", p, j) + ";\n";
+            text += "        " + at("b", order[i]) + " -= f*" + at("b", order[p]) + ";\n    }\n";
+        }
+    }
+    for (int p = n - 1; p >= 0; p--) {
+        for (int j = p + 1; j < n; j++)
+            if (isEntry(p, j))
+                text += "    " + at("b", order[p]) + " -= " + at("A", p, j) + "*" + at("b", order[j]) + ";\n";
+        text += "    " + at("b", order[p]) + " *= " + at("A", p, p) + ";\n";
+    }
+    return text + "}\n\n";
+}
+
+string ClusterAlgebra::writeMove() const {
+    const int n = (int) pairs.size();
+    string text = "inline DEVICE void move_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed (*s)[3]) {\n";
+    for (int k = 0; k < n; k++)
+        for (int l = 0; l < n; l++) {
+            const string w = weight(k, l);
+            if (!w.empty())
+                text += "    UNROLL for (int d = 0; d < 3; d++)\n        " + at("s", k) + "[d] += " + w + "*" +
+                        at("x", l) + "*" + at("r", l) + "[d];\n";
+        }
+    return text + "}\n";
+}
+
+string ClusterAlgebra::write() const {
+    return writeFactorize() + writeSolve() + writeNewton() + writeMove();
+}

@@ -1,0 +1,341 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "DeviceSteps.h"
+#include <algorithm>
+#include <cmath>
+
+using namespace OpenMMVRattle;
+using OpenMM::ComputeKernel;
+using std::vector;
+
+namespace {
+
+const int NUM_TRIALS = 4;
+// Stands for no limit of a step, in single precision too (ps).
+const double NO_LIMIT = 1e30;
+// A step that is none: the state was changed by others.
+const int NO_STEP = -1;
+// What rounding allows: of the constraints and of (3.14).
+const double SINGLE_TOLERANCE = 1e-5, MIXED_TOLERANCE = 1e-12, DOUBLE_TOLERANCE = 1e-13;
+const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
+const double MARGIN = 0.1;
+
+} // namespace
+
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system) :
+        context(context), kinds(ClusterKinds::find(system)), settings(),
+        isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
+        isWide(context.getSupportsDoublePrecision()), numGroups(0), half(0), stepNumber(0), groupEnergy(0),
+        elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
+}
+
+double DeviceSteps::tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance) {
+    const double least = context.getUseDoublePrecision()  ? DOUBLE_TOLERANCE
+                         : context.getUseMixedPrecision() ? MIXED_TOLERANCE
+                                                          : SINGLE_TOLERANCE;
+    return std::max(tolerance, least);
+}
+
+void DeviceSteps::initialize() {
+    const int mixedSize = isMixed ? 8 : 4, wideSize = isWide ? 8 : 4;
+    // An array has at least one element.
+    vector<int> atomData;
+    vector<double> lengthData;
+    for (const ClusterKind& kind : kinds) {
+        for (int i = 0; i < kind.numAtoms; i++)
+            for (const vector<int>& cluster : kind.atoms)
+                atomData.push_back(cluster[i]);
+        for (size_t k = 0; k < kind.pairs.size(); k++)
+            for (const vector<double>& cluster : kind.lengths)
+                lengthData.push_back(cluster[k]);
+    }
+    atomData.resize(std::max<size_t>(1, atomData.size()));
+    lengthData.resize(std::max<size_t>(1, lengthData.size()));
+    atoms.initialize<int>(context, atomData.size(), "vrattleAtoms");
+    atoms.upload(atomData);
+    lengths.initialize(context, lengthData.size(), mixedSize, "vrattleLengths");
+    lengths.upload(lengthData, true);
+    multipliers.initialize(context, lengthData.size(), mixedSize, "vrattleMultipliers");
+    context.clearBuffer(multipliers);
+    const int group = StepProgram::GROUP_SIZE, needed = (program->getNumSlots() + group - 1) / group;
+    numGroups = std::max(1, std::min(needed, context.getNumThreadBlocks()));
+    oldPositions.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldPositions");
+    oldVelocities.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldVelocities");
+    for (OpenMM::ComputeArray& array : trials)
+        array.initialize(context, Control::TrialSize, wideSize, "vrattleTrial");
+    failure.initialize<int>(context, 2, "vrattleFailure");
+    failure.upload(vector<int>{0, 0});
+    iterationCounts.initialize<int>(context, numGroups * group, "vrattleIterations");
+    context.clearBuffer(iterationCounts);
+}
+
+void DeviceSteps::setSettings(const Settings& newSettings) {
+    settings = newSettings;
+    compile(StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
+    vector<double> numbers(Control::FirstTerm + 3 * settings.terms.size());
+    numbers[Control::Nominal] = settings.stepSize;
+    numbers[Control::Smallest] = settings.density.getSmallest();
+    numbers[Control::Lower] = settings.density.getLower();
+    numbers[Control::Slope] = settings.density.getUpperSlope();
+    numbers[Control::Curve] = settings.density.getCurve();
+    numbers[Control::DensityTolerance] =
+        std::max(MARGIN * settings.tolerance, isMixed ? DENSITY_TOLERANCE : SINGLE_DENSITY_TOLERANCE);
+    for (size_t k = 0; k < settings.terms.size(); k++) {
+        numbers[Control::FirstTerm + 3 * k] = settings.terms[k].weight;
+        numbers[Control::FirstTerm + 3 * k + 1] = settings.terms[k].power;
+        numbers[Control::FirstTerm + 3 * k + 2] = settings.terms[k].reference;
+    }
+    settingsArray.upload(numbers, true);
+}
+
+void DeviceSteps::compile(StepProgram::Update update) {
+    std::unique_ptr<StepProgram> next(new StepProgram(kinds, settings.terms, update, isMixed, isWide));
+    const bool isFirst = program == nullptr;
+    program.swap(next);
+    if (isFirst)
+        initialize();
+    // What depends on the program. The kernels know arrays by their objects, whose size may change.
+    const int mixedSize = isMixed ? 8 : 4, wideSize = isWide ? 8 : 4, numSums = program->getNumSums();
+    auto resize = [&](OpenMM::ComputeArray& array, size_t size, int elementSize, const char* name) {
+        if (!array.isInitialized())
+            array.initialize(context, size, elementSize, name);
+        else if (array.getSize() != size)
+            array.resize(size);
+    };
+    resize(settingsArray, Control::FirstTerm + 3 * settings.terms.size(), wideSize, "vrattleSettings");
+    for (OpenMM::ComputeArray& array : control)
+        resize(array, Control::FirstValue + settings.terms.size(), wideSize, "vrattleControl");
+    resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numGroups, mixedSize, "vrattlePartials");
+    for (OpenMM::ComputeArray& array : trialPartials)
+        resize(array, numSums * numGroups, mixedSize, "vrattleTrialPartials");
+    std::string key = program->getSource();
+    for (const auto& define : program->getDefines())
+        key += define.first + "=" + define.second + "\n";
+    auto found = compiled.find(key);
+    if (found == compiled.end()) {
+        OpenMM::ComputeProgram text = context.compileProgram(program->getSource(), program->getDefines());
+        Kernels created;
+        created.finish = text->createKernel("finishStep");
+        created.evaluate = text->createKernel("evaluateState");
+        if (program->hasHalfSums())
+            created.trial = text->createKernel("tryStep");
+        created.advance = text->createKernel("advanceStep");
+        created.restore = text->createKernel("restoreState");
+        setArguments(created);
+        found = compiled.insert({key, created}).first;
+    }
+    kernels = found->second;
+}
+
+// The arguments in the order of kernels/step.cc; those that change from launch to launch come first and are set there.
+void DeviceSteps::setArguments(Kernels& created) {
+    // Outside mixed precision there are no corrections, and nothing reads the argument.
+    OpenMM::ArrayInterface& corrections =
+        context.getUseMixedPrecision() ? context.getPosqCorrection() : context.getPosq();
+    auto addEmpty = [](ComputeKernel& kernel, int count) {
+        for (int i = 0; i < count; i++)
+            kernel->addArg();
+    };
+    auto addState = [&](ComputeKernel& kernel) {
+        kernel->addArg(program->getNumSlots());
+        kernel->addArg(context.getPaddedNumAtoms());
+        kernel->addArg(atoms);
+        kernel->addArg(lengths);
+        kernel->addArg(context.getPosq());
+        kernel->addArg(corrections);
+        kernel->addArg(context.getVelm());
+        kernel->addArg(context.getLongForceBuffer());
+        kernel->addArg(multipliers);
+        kernel->addArg(failure);
+    };
+    addEmpty(created.finish, 5); // step, kick, isFormed, isStored, control
+    created.finish->addArg(settingsArray);
+    created.finish->addArg(partials);
+    addState(created.finish);
+
+    addEmpty(created.evaluate, 5); // step, isRescaled, groupEnergy, numPartials, control
+    created.evaluate->addArg(settingsArray);
+    created.evaluate->addArg(partials);
+    created.evaluate->addArg(failure);
+
+    if (created.trial) {
+        addEmpty(created.trial, 6); // step, index, groupEnergy, tolerance, numPartials, control
+        created.trial->addArg(settingsArray);
+        created.trial->addArg(partials);
+        addEmpty(created.trial, 4); // the last trial and its sums, the next one and its sums
+        addState(created.trial);
+    }
+
+    addEmpty(created.advance, 7); // step, groupEnergy, maxStep, tolerance, numPartials, control, nextControl
+    created.advance->addArg(settingsArray);
+    created.advance->addArg(partials);
+    created.advance->addArg(trials[NUM_TRIALS % 2]);
+    created.advance->addArg(trialPartials[NUM_TRIALS % 2]);
+    created.advance->addArg(oldPositions);
+    created.advance->addArg(oldVelocities);
+    created.advance->addArg(iterationCounts);
+    addState(created.advance);
+
+    created.restore->addArg(context.getNumAtoms());
+    created.restore->addArg(context.getPosq());
+    created.restore->addArg(corrections);
+    created.restore->addArg(context.getVelm());
+    created.restore->addArg(oldPositions);
+    created.restore->addArg(oldVelocities);
+}
+
+// A placeholder needs the exact type.
+void DeviceSteps::setMixed(ComputeKernel& kernel, int index, double value) {
+    if (isMixed)
+        kernel->setArg(index, value);
+    else
+        kernel->setArg(index, (float) value);
+}
+
+void DeviceSteps::setWide(ComputeKernel& kernel, int index, double value) {
+    if (isWide)
+        kernel->setArg(index, value);
+    else
+        kernel->setArg(index, (float) value);
+}
+
+void DeviceSteps::launch(ComputeKernel& kernel) {
+    kernel->execute(numGroups * StepProgram::GROUP_SIZE, StepProgram::GROUP_SIZE);
+}
+
+void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStored) {
+    kernels.finish->setArg(0, step);
+    setMixed(kernels.finish, 1, kick);
+    kernels.finish->setArg(2, (int) isFormed);
+    kernels.finish->setArg(3, (int) isStored);
+    kernels.finish->setArg(4, control[half]);
+    launch(kernels.finish);
+}
+
+void DeviceSteps::launchEvaluate(int step, bool isRescaled) {
+    kernels.evaluate->setArg(0, step);
+    kernels.evaluate->setArg(1, (int) isRescaled);
+    setWide(kernels.evaluate, 2, groupEnergy);
+    kernels.evaluate->setArg(3, numGroups);
+    kernels.evaluate->setArg(4, control[half]);
+    kernels.evaluate->execute(StepProgram::GROUP_SIZE, StepProgram::GROUP_SIZE);
+}
+
+bool DeviceSteps::begin(const State& state, double energy) {
+    vector<double> block(Control::FirstValue + settings.terms.size(), 0.0);
+    block[Control::Density] = state.density;
+    block[Control::StepSize] = settings.stepSize / state.density;
+    block[Control::DensityOffset] = state.densityOffset;
+    block[Control::IsHalfKnown] = state.hasHalfStepValue;
+    block[Control::HalfU] = state.halfStepValue;
+    control[half].upload(block, true);
+    numStepsRead = numRescuesRead = 0;
+    elapsedRead = 0;
+    groupEnergy = energy;
+    launchFinish(NO_STEP, 0, true, false);
+    launchEvaluate(NO_STEP, false);
+    return !hasFailed();
+}
+
+bool DeviceSteps::change(double energy) {
+    launchEvaluate(NO_STEP, false); // u before the change
+    groupEnergy = energy;
+    launchFinish(NO_STEP, 0, true, true);
+    launchEvaluate(NO_STEP, true);
+    return !hasFailed();
+}
+
+// Of a change; such a failure leaves nothing to put back.
+bool DeviceSteps::hasFailed() {
+    vector<int> codes;
+    failure.download(codes);
+    if (codes[0] == 0)
+        return false;
+    failure.upload(vector<int>{0, 0});
+    return true;
+}
+
+void DeviceSteps::advance(double maxStep) {
+    stepNumber++;
+    if (kernels.trial)
+        for (int i = 0; i < NUM_TRIALS; i++) {
+            kernels.trial->setArg(0, stepNumber);
+            kernels.trial->setArg(1, i);
+            setWide(kernels.trial, 2, groupEnergy);
+            setMixed(kernels.trial, 3, settings.tolerance);
+            kernels.trial->setArg(4, numGroups);
+            kernels.trial->setArg(5, control[half]);
+            kernels.trial->setArg(8, trials[i % 2]);
+            kernels.trial->setArg(9, trialPartials[i % 2]);
+            kernels.trial->setArg(10, trials[(i + 1) % 2]);
+            kernels.trial->setArg(11, trialPartials[(i + 1) % 2]);
+            launch(kernels.trial);
+        }
+    kernels.advance->setArg(0, stepNumber);
+    setWide(kernels.advance, 1, groupEnergy);
+    setWide(kernels.advance, 2, std::min(maxStep, NO_LIMIT));
+    setMixed(kernels.advance, 3, settings.tolerance);
+    kernels.advance->setArg(4, numGroups);
+    kernels.advance->setArg(5, control[half]);
+    kernels.advance->setArg(6, control[1 - half]);
+    launch(kernels.advance);
+    half = 1 - half;
+}
+
+void DeviceSteps::finish(double energy) {
+    groupEnergy = energy;
+    launchFinish(stepNumber, 0.5, false, true);
+}
+
+DeviceSteps::Report DeviceSteps::read() {
+    launchEvaluate(stepNumber, false);
+    Report report = {};
+    vector<int> codes;
+    failure.download(codes);
+    report.hasFailed = codes[0] != 0;
+    if (report.hasFailed)
+        undo(stepNumber - codes[0] + 1);
+    fill(report);
+    return report;
+}
+
+DeviceSteps::Report DeviceSteps::putBack() {
+    Report report = {};
+    vector<int> codes;
+    failure.download(codes);
+    report.hasFailed = codes[0] != 0;
+    undo(report.hasFailed ? stepNumber - codes[0] + 1 : 1);
+    fill(report);
+    return report;
+}
+
+// Put back the state before the last steps, of which the first is the one whose copy there is: the others have done nothing.
+void DeviceSteps::undo(int numSteps) {
+    kernels.restore->execute(context.getNumAtoms());
+    if (numSteps % 2 == 1)
+        half = 1 - half;
+    failure.upload(vector<int>{0, 0});
+}
+
+void DeviceSteps::fill(Report& report) {
+    vector<double> block;
+    control[half].download(block, true);
+    report.state = {block[Control::Density], block[Control::DensityOffset], program->hasHalfSums(),
+                    block[Control::HalfU]};
+    report.stepSize = block[Control::StepSize];
+    report.u = block[Control::U];
+    report.values.assign(block.begin() + Control::FirstValue, block.end());
+    report.elapsed = block[Control::Elapsed] - elapsedRead;
+    report.numSteps = (int) std::lround(block[Control::Steps] - numStepsRead);
+    report.numRescues = (int) std::lround(block[Control::Rescues] - numRescuesRead);
+    elapsedRead = block[Control::Elapsed];
+    numStepsRead = block[Control::Steps];
+    numRescuesRead = block[Control::Rescues];
+}
+
+long long DeviceSteps::getNumIterations() {
+    vector<int> counts;
+    iterationCounts.download(counts);
+    return *std::max_element(counts.begin(), counts.end());
+}

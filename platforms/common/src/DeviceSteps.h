@@ -1,0 +1,115 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_DEVICESTEPS_H_
+#define OPENMMVRATTLE_DEVICESTEPS_H_
+
+#include "ClusterKinds.h"
+#include "StepProgram.h"
+#include "openmm/common/ComputeArray.h"
+#include "openmm/common/ComputeContext.h"
+#include <map>
+#include <memory>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The regular steps of VRATTLE on a device: what is launched, and what the host reads. The state between two steps is on the
+ * device alone: positions and velocities in OpenMM's arrays, the density and what goes with it in a control block. Forces are
+ * somebody else's to compute between advance() and finish().
+ *
+ * Nothing here waits for the device but read(), putBack() and what changes settings.
+ */
+class DeviceSteps {
+public:
+    struct Settings {
+        double stepSize;
+        StepDensity density;
+        StepDensity::Update update;
+        bool isFixedStep;
+        double tolerance;
+        std::vector<StepMonitor::Term> terms; // with the references in force
+    };
+    /** What of the state is in the control block. */
+    struct State {
+        double density;       // rho[n-1/2]
+        double densityOffset; // what (3.14) and (3.15) differed by in the last step
+        bool hasHalfStepValue;
+        double halfStepValue; // u(q[n],p[n-1/2])
+    };
+    struct Report {
+        State state;
+        double stepSize, elapsed; // of the last step, and since the last read() (ps)
+        int numSteps, numRescues; // since the last read()
+        double u;
+        std::vector<double> values; // u(q[n],p[n]) and U_k
+        bool hasFailed;
+    };
+
+    /** @throws OpenMMException    if a cluster of constraints is too large */
+    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system);
+    /** Take over settings, after which begin() is due. */
+    void setSettings(const Settings& settings);
+    /** The tolerance that is in force where another is asked for: rounding allows none below a certain one. */
+    static double tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance);
+
+    /**
+     * Take over a state: the positions and velocities that are on the device, where the forces have been computed. The velocities
+     * are left as they are.
+     *
+     * @param groupEnergy    the energy of the monitor's force group there
+     * @return false if the constraints depend on each other or a monitor is no number
+     */
+    bool begin(const State& state, double groupEnergy);
+    /** Go on from positions, velocities and forces that are others now: the velocities are projected, the density is scaled with u. */
+    bool change(double groupEnergy);
+
+    /** The first half of a step, which is not to be longer than maxStep. */
+    void advance(double maxStep);
+    /** The second half, after the forces at the new positions. */
+    void finish(double groupEnergy);
+    /**
+     * Wait for the steps, and evaluate the monitors where they have led. If one has failed, positions, velocities and density are
+     * those before it, those after it have not happened, and begin() is due after the forces. numSteps counts those completed.
+     */
+    Report read();
+    /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
+    Report putBack();
+    /** The number of iterations of the cluster that has needed most, since the beginning. */
+    long long getNumIterations();
+
+private:
+    struct Kernels {
+        OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
+    };
+    void initialize();
+    void compile(StepProgram::Update update);
+    void setArguments(Kernels& created);
+    void setMixed(OpenMM::ComputeKernel& kernel, int index, double value);
+    void setWide(OpenMM::ComputeKernel& kernel, int index, double value);
+    void launch(OpenMM::ComputeKernel& kernel);
+    void launchFinish(int step, double kick, bool isFormed, bool isStored);
+    void launchEvaluate(int step, bool isRescaled);
+    bool hasFailed();
+    void undo(int numSteps);
+    void fill(Report& report);
+    OpenMM::ComputeContext& context;
+    std::vector<ClusterKind> kinds;
+    Settings settings;
+    std::unique_ptr<StepProgram> program;
+    bool isMixed, isWide; // mixed is double; there are doubles
+    int numGroups;  // of work, each of which leaves its sums
+    int half;       // the control block that is in force
+    int stepNumber; // of the last advance()
+    double groupEnergy;
+    double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
+    OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2];
+    OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts;
+    std::map<std::string, Kernels> compiled; // by what the text depends on
+    Kernels kernels;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_DEVICESTEPS_H_

@@ -1,0 +1,307 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "StepProgram.h"
+#include "ClusterAlgebra.h"
+#include "DeviceSources.h"
+#include "constraints/ConstraintMatrix.h"
+#include <algorithm>
+#include <cmath>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using std::map;
+using std::string;
+using std::to_string;
+using std::vector;
+
+namespace {
+
+const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
+
+void replaceAll(string& text, const string& from, const string& to) {
+    for (size_t at = text.find(from); at != string::npos; at = text.find(from, at + to.size()))
+        text.replace(at, from.size(), to);
+}
+
+string literal(double value) {
+    std::stringstream text;
+    text.precision(17);
+    text << std::scientific << value;
+    return text.str();
+}
+
+// x^n by squaring.
+string writePower(int n) {
+    string text = "mixed result = 1, square = x;\n";
+    for (; n > 0; n /= 2) {
+        if (n % 2 == 1)
+            text += "    result *= square;\n";
+        if (n > 1)
+            text += "    square *= square;\n";
+    }
+    return text + "    return result;";
+}
+
+// The sums of the monitors that are wanted, and what each takes.
+enum Quantity {
+    MultiplierSquares, // sum Lambda^2, of g = |r|^2 - L^2
+    ConstraintWork,    // Lambda^T K Lambda
+    AppliedSquares,    // sum |F|^2/m
+    MultiplierPowers,
+    ForcePowers,
+    ForceSquares,
+    KineticSquares, // sum m |v|^2
+    SpeedSquares,   // sum |v|^2
+    LargestForce,   // max |F|^2
+    LargestArc,     // max |F|^2 + |v|^2
+    Failures        // of trials
+};
+enum Merge { Add, Largest, Power };
+struct QuantityText {
+    Merge merge;
+    bool ofConstraint;
+    const char* term; // added to it
+};
+const map<Quantity, QuantityText> QUANTITIES = {{MultiplierSquares, {Add, true, "lambda*lambda/4"}},
+                                                {ConstraintWork, {Add, true, "lambda*rightSide"}},
+                                                {AppliedSquares, {Add, false, "w*forceSquared"}},
+                                                {MultiplierPowers, {Power, true, "fabs(lambda)/2"}},
+                                                {ForcePowers, {Power, false, "sqrt(forceSquared)"}},
+                                                {ForceSquares, {Add, false, "forceSquared"}},
+                                                {KineticSquares, {Add, false, "dot3(v, v)/w"}},
+                                                {SpeedSquares, {Add, false, "dot3(v, v)"}},
+                                                {LargestForce, {Largest, false, "forceSquared"}},
+                                                {LargestArc, {Largest, false, "forceSquared + dot3(v, v)"}},
+                                                {Failures, {Add, false, nullptr}}};
+
+struct MonitorText {
+    vector<Quantity> quantities;
+    string value; // in which $0 and $1 stand for the sums
+};
+const map<StepMonitor::Kind, MonitorText> MONITORS = {
+    {StepMonitor::ConstraintMultipliers, {{MultiplierSquares}, "sqrt($0)"}}, // (4.4)
+    {StepMonitor::ConstraintForce, {{ConstraintWork}, "sqrt(max($0, (wide) 0))"}},
+    {StepMonitor::AppliedForce, {{AppliedSquares}, "sqrt($0)"}},
+    {StepMonitor::ConstraintAndAppliedForce, {{ConstraintWork, AppliedSquares}, "sqrt(max($0, (wide) 0) + $1)"}},
+    {StepMonitor::MultiplierPNorm, {{MultiplierPowers}, "$0*pow($0b, (wide) $p)"}},
+    {StepMonitor::ForcePNorm, {{ForcePowers}, "$0*pow($0b, (wide) $p)"}},
+    {StepMonitor::VectorField, {{ForceSquares, KineticSquares}, "sqrt($0 + $1)"}}, // (4.1)
+    {StepMonitor::MaxForce, {{LargestForce}, "sqrt($0)"}},
+    {StepMonitor::ArcLength, {{ForceSquares, SpeedSquares}, "sqrt($0 + $1)"}},
+    {StepMonitor::MaxParticleArcLength, {{LargestArc}, "sqrt($0)"}},
+    {StepMonitor::ForceGroupEnergy, {{}, "groupEnergy"}}};
+
+bool usesMultipliers(StepMonitor::Kind kind) {
+    const vector<Quantity>& quantities = MONITORS.at(kind).quantities;
+    return std::any_of(quantities.begin(), quantities.end(),
+                       [](Quantity quantity) { return QUANTITIES.at(quantity).ofConstraint; });
+}
+
+bool usesSpeeds(StepMonitor::Kind kind) {
+    const vector<Quantity>& quantities = MONITORS.at(kind).quantities;
+    return std::any_of(quantities.begin(), quantities.end(), [](Quantity quantity) {
+        return quantity == KineticSquares || quantity == SpeedSquares || quantity == LargestArc;
+    });
+}
+
+} // namespace
+
+StepProgram::Update StepProgram::updateOf(const vector<StepMonitor::Term>& terms, bool isFixedStep,
+                                          StepDensity::Update update) {
+    if (isFixedStep || terms.empty())
+        return Fixed;
+    if (update == StepDensity::Bounded)
+        return Bounded;
+    const bool dependsOnVelocities = std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) {
+        return usesMultipliers(term.kind) || usesSpeeds(term.kind);
+    });
+    return update == StepDensity::SemiExplicit && dependsOnVelocities ? SemiExplicit : Sum;
+}
+
+StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMonitor::Term>& terms, Update update,
+                         bool isMixed, bool isWide) : update(update) {
+    writeMonitors(terms);
+    writeClusters(kinds);
+    source = DeviceSources::step;
+    for (const auto& word : words)
+        replaceAll(source, word.first, word.second);
+    const map<string, int> numbers = {{"GROUP_SIZE", GROUP_SIZE},
+                                      {"FIXED", Fixed},
+                                      {"SUM", Sum},
+                                      {"BOUNDED", Bounded},
+                                      {"SEMI_EXPLICIT", SemiExplicit},
+                                      {"UPDATE", update},
+                                      {"HALF_SUMS", update == SemiExplicit ? 1 : 0},
+                                      {"NUM_MONITORS", (int) terms.size()},
+                                      {"NUM_VALUES", std::max(1, (int) terms.size())},
+                                      {"NUM_SUMS", numSums},
+                                      {"DENSITY", Control::Density},
+                                      {"STEP_SIZE", Control::StepSize},
+                                      {"ELAPSED", Control::Elapsed},
+                                      {"ELAPSED_REST", Control::ElapsedRest},
+                                      {"STEPS", Control::Steps},
+                                      {"RESCUES", Control::Rescues},
+                                      {"MONITOR_U", Control::U},
+                                      {"HALF_U", Control::HalfU},
+                                      {"IS_HALF_KNOWN", Control::IsHalfKnown},
+                                      {"DENSITY_OFFSET", Control::DensityOffset},
+                                      {"IS_SHORTENED", Control::IsShortened},
+                                      {"FIRST_VALUE", Control::FirstValue},
+                                      {"CONTROL_SIZE", Control::FirstValue + (int) terms.size()},
+                                      {"NOMINAL", Control::Nominal},
+                                      {"SMALLEST", Control::Smallest},
+                                      {"LOWER", Control::Lower},
+                                      {"SLOPE", Control::Slope},
+                                      {"CURVE", Control::Curve},
+                                      {"DENSITY_TOLERANCE", Control::DensityTolerance},
+                                      {"FIRST_TERM", Control::FirstTerm},
+                                      {"NOT_CONVERGED", Control::NotConverged},
+                                      {"INVALID_MONITOR", Control::InvalidMonitor},
+                                      {"DEPENDENT_CONSTRAINTS", Control::DependentConstraints},
+                                      {"NUM_CODES", Control::NumCodes},
+                                      {"TRIAL_STATUS", 0},
+                                      {"TRIAL_U", 1},
+                                      {"TRIAL_PREVIOUS", 2},
+                                      {"TRIAL_HALF_U", 3},
+                                      {"TRIAL_DENSITY", 4},
+                                      {"TRIAL_LAST_DENSITY", 5},
+                                      {"TRIAL_LAST_MISMATCH", 6},
+                                      {"TRIAL_COUNT", 7},
+                                      {"TRIAL_SIZE", Control::TrialSize},
+                                      {"TRYING", 0},
+                                      {"CONVERGED", 1},
+                                      {"UNSOLVED", 2},
+                                      {"MAX_ITERATIONS", MAX_ITERATIONS}};
+    for (const auto& number : numbers)
+        defines[number.first] = to_string(number.second);
+    defines["WIDE"] = isWide ? "double" : "float";
+    // A float has lost the sign of a pivot below this fraction.
+    defines["MIN_PIVOT"] = isMixed ? literal(ConstraintMatrix::MIN_RELATIVE_PIVOT) : "1e-5f";
+    defines["MARGIN"] = "0.1f";
+    defines["SLOW_CONVERGENCE"] = "0.25f";
+    defines["BOUND_MARGIN"] = literal(StepDensity::DOMAIN_MARGIN);
+    defines["SLIVER"] = "1e-6f";
+}
+
+// The sums that the monitors need, each once. A p-norm's sum takes two places.
+void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
+    typedef std::pair<Quantity, double> Key; // with the order of a p-norm, else 0
+    map<Key, int> places;
+    numSums = 0;
+    auto keyOf = [](Quantity quantity, double order) {
+        return Key(quantity, QUANTITIES.at(quantity).merge == Power ? order : 0.0);
+    };
+    auto add = [&](const Key& key) {
+        if (places.count(key) == 0) {
+            places[key] = numSums;
+            numSums += QUANTITIES.at(key.first).merge == Power ? 2 : 1;
+        }
+        return places[key];
+    };
+    string values;
+    for (size_t k = 0; k < terms.size(); k++) {
+        const MonitorText& monitor = MONITORS.at(terms[k].kind);
+        string value = monitor.value;
+        for (size_t i = 0; i < monitor.quantities.size(); i++) {
+            const int place = add(keyOf(monitor.quantities[i], terms[k].order));
+            replaceAll(value, "$" + to_string(i) + "b", "(wide) sums[" + to_string(place + 1) + "]");
+            replaceAll(value, "$" + to_string(i), "(wide) sums[" + to_string(place) + "]");
+        }
+        replaceAll(value, "$p", literal(1 / terms[k].order));
+        values += "values[" + to_string(k) + "] = " + value + ";\n    ";
+    }
+    if (hasHalfSums() || numSums == 0) // an array has at least one element
+        defines["FAILURES"] = to_string(add(Key(Failures, 0)));
+    string constraintTerms, particleTerms, mergeTerms, powers;
+    map<double, int> orders; // each with a number for its functions
+    for (const auto& entry : places) {
+        const QuantityText& quantity = QUANTITIES.at(entry.first.first);
+        const string sum = "sums[" + to_string(entry.second) + "]", other = "other[" + to_string(entry.second) + "]";
+        string& text = quantity.ofConstraint ? constraintTerms : particleTerms;
+        const string address = to_string(entry.second);
+        switch (quantity.merge) {
+        case Add:
+            if (quantity.term != nullptr)
+                text += sum + " += " + quantity.term + ";\n    ";
+            mergeTerms += sum + " += " + other + ";\n    ";
+            break;
+        case Largest:
+            text += sum + " = max(" + sum + ", " + quantity.term + ");\n    ";
+            mergeTerms += sum + " = max(" + sum + ", " + other + ");\n    ";
+            break;
+        case Power: {
+            const string name =
+                "Power_" + to_string(orders.insert({entry.first.second, (int) orders.size()}).first->second);
+            text += "add" + name + "(sums + " + address + ", " + quantity.term + ");\n    ";
+            mergeTerms += "merge" + name + "(sums + " + address + ", other + " + address + ");\n    ";
+            break;
+        }
+        }
+    }
+    words["CONSTRAINT_TERMS"] = constraintTerms;
+    words["PARTICLE_TERMS"] = particleTerms;
+    words["MERGE_TERMS"] = mergeTerms;
+    words["MONITOR_VALUES"] = values;
+    for (const auto& order : orders) {
+        const double p = order.first;
+        const bool isWhole = p == std::floor(p) && p <= LARGEST_POWER;
+        string text = DeviceSources::power;
+        replaceAll(text, "RAISE", isWhole ? writePower((int) p) : "return pow(x, (mixed) " + literal(p) + ");");
+        replaceAll(text, "_ORDER", "_" + to_string(order.second));
+        powers += text;
+    }
+    words["POWER_FUNCTIONS"] = powers;
+}
+
+void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
+    string functions, finishCases, trialCases, advanceCases;
+    numSlots = 0;
+    int numAtoms = 0, numLengths = 0;
+    for (size_t i = 0; i < kinds.size(); i++) {
+        const ClusterKind& kind = kinds[i];
+        const int count = (int) kind.atoms.size(), numConstraints = (int) kind.pairs.size();
+        const string name = "_" + to_string(i);
+        places.push_back({numSlots, numAtoms, numLengths});
+        string text = numConstraints == 0 ? DeviceSources::particle : DeviceSources::cluster;
+        if (numConstraints > 0) {
+            const ClusterAlgebra algebra(kind.pairs);
+            string first, second;
+            for (const auto& pair : kind.pairs) {
+                first += (first.empty() ? "" : ", ") + to_string(pair.first);
+                second += (second.empty() ? "" : ", ") + to_string(pair.second);
+            }
+            text.erase(0, text.find("\nCLUSTER_ALGEBRA\n") + 17); // the explanation
+            text = algebra.write() + text;
+            replaceAll(text, "FIRST_ATOMS", "{" + first + "}");
+            replaceAll(text, "SECOND_ATOMS", "{" + second + "}");
+            replaceAll(text, "NUM_ENTRIES", to_string(algebra.getNumEntries()));
+        }
+        for (const auto& word : map<string, int>{{"NUM_ATOMS", kind.numAtoms},
+                                                 {"NUM_CONSTRAINTS", numConstraints},
+                                                 {"NUM_CLUSTERS", count},
+                                                 {"ATOM_BASE", numAtoms},
+                                                 {"LENGTH_BASE", numLengths}})
+            replaceAll(text, word.first, to_string(word.second));
+        replaceAll(text, "_KIND", name);
+        functions += text;
+        // A warp has clusters of one kind only.
+        const int next = numSlots + (count + SLOT_UNIT - 1) / SLOT_UNIT * SLOT_UNIT;
+        const string head = string(i == 0 ? "" : "else ") + "if (slot < " + to_string(next) + ") {\n            " +
+                            "const int c = slot - " + to_string(numSlots) + ";\n            if (c < " +
+                            to_string(count) + ")\n                ";
+        const string tail = ";\n        }\n        ";
+        finishCases += head + "isRegular = finish" + name +
+                       "(c, CLUSTER_ARGUMENTS, kick*dt, halfKick, formHalf, isStored != 0, sums, halfSums)" + tail;
+        trialCases += head + "isSolved = try" + name + "(c, CLUSTER_ARGUMENTS, dt, tolerance, sums)" + tail;
+        advanceCases += head + "iterations = advance" + name +
+                        "(c, CLUSTER_ARGUMENTS, dt, tolerance, oldPositions, oldVelocities)" + tail;
+        numSlots = next;
+        numAtoms += count * kind.numAtoms;
+        numLengths += count * numConstraints;
+    }
+    words["CLUSTER_FUNCTIONS"] = functions;
+    words["FINISH_CASES"] = finishCases;
+    words["TRIAL_CASES"] = trialCases;
+    words["ADVANCE_CASES"] = advanceCases;
+}

@@ -1,0 +1,107 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_STEPPROGRAM_H_
+#define OPENMMVRATTLE_STEPPROGRAM_H_
+
+#include "ClusterKinds.h"
+#include "step/StepDensity.h"
+#include "step/StepMonitor.h"
+#include <map>
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/** The number of a word that host and device share; see StepProgram.cpp for the words. */
+namespace Control {
+/** The control block: what changes from step to step. The values of the monitors follow. */
+enum Field {
+    Density,       // rho[n-1/2]
+    StepSize,      // of the last step
+    Elapsed,       // the time since the host has looked last, and what its rounding has left
+    ElapsedRest,
+    Steps,         // since the host has looked last
+    Rescues,       // likewise
+    U,             // u(q[n],p[n]), once evaluateState() has found it
+    HalfU,         // u(q[n],p[n-1/2]), where IsHalfKnown says so; else it is in the sums
+    IsHalfKnown,
+    DensityOffset, // what (3.14) and (3.15) differed by in the last step
+    IsShortened,   // the last step was cut short
+    FirstValue     // U_k
+};
+/** The settings; the weight, the power and the reference value of each monitor follow. */
+enum Setting {
+    Nominal,  // h
+    Smallest, // a = h/maximum
+    Lower,    // B(u) = (Lower + Slope u)/(1 + Curve u)
+    Slope,
+    Curve,
+    DensityTolerance, // of (3.14), relative
+    FirstTerm
+};
+/** What makes a step fail; the slot of the cluster is above. */
+enum Failure { NotConverged, InvalidMonitor, DependentConstraints, NumCodes };
+/** Numbers of the trial of a density. */
+const int TrialSize = 9;
+} // namespace Control
+
+/**
+ * The text of the device's program, in OpenMM's common language for CUDA, OpenCL and HIP. It depends on the constraint graphs, on
+ * which sums the monitors need and on the update, and on no number that a user changes in mid-run without changing those.
+ */
+class StepProgram {
+public:
+    enum Update { Fixed, Sum, Bounded, SemiExplicit };
+    /** Where the data of a kind lie. */
+    struct Place {
+        int firstSlot, firstAtom, firstLength;
+    };
+    static const int GROUP_SIZE = 64, SLOT_UNIT = 32;
+
+    /**
+     * @param kinds         the clusters
+     * @param terms         the monitors
+     * @param update        how the density is found
+     * @param isMixed       whether positions and velocities are in double precision
+     * @param isWide        whether the device has doubles
+     */
+    StepProgram(const std::vector<ClusterKind>& kinds, const std::vector<StepMonitor::Term>& terms, Update update,
+                bool isMixed, bool isWide);
+    /** The update as a device sees it: what does not depend on velocities needs no iteration. */
+    static Update updateOf(const std::vector<StepMonitor::Term>& terms, bool isFixedStep, StepDensity::Update update);
+    const std::string& getSource() const {
+        return source;
+    }
+    /** Macros to be defined before the text. */
+    const std::map<std::string, std::string>& getDefines() const {
+        return defines;
+    }
+    const std::vector<Place>& getPlaces() const {
+        return places;
+    }
+    /** The number of threads that have something to do. */
+    int getNumSlots() const {
+        return numSlots;
+    }
+    /** The number of sums that each work group leaves. */
+    int getNumSums() const {
+        return numSums;
+    }
+    bool hasHalfSums() const {
+        return update == SemiExplicit;
+    }
+
+private:
+    void writeMonitors(const std::vector<StepMonitor::Term>& terms);
+    void writeClusters(const std::vector<ClusterKind>& kinds);
+    std::string source;
+    std::map<std::string, std::string> defines, words;
+    std::vector<Place> places;
+    int numSlots, numSums;
+    Update update;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_STEPPROGRAM_H_

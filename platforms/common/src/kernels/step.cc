@@ -1,0 +1,414 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// The steps of VRATTLE on a device (docs/method.md). From the on-step state (q[n], v[n], F[n], rho[n-1/2]) a step is plain RATTLE
+// with the step size h/rho[n+1/2]: what the half-step momentum differs by lies in the range of G^T and is absorbed by lambda.
+//
+// Words in capitals that are no macros of OpenMM come from the host (StepProgram.cpp). `mixed` is OpenMM's type for positions and
+// velocities; `wide` is double where the device has it.
+
+#define UNROLL _Pragma("unroll")
+
+typedef WIDE wide;
+
+inline DEVICE mixed dot3(const mixed* a, const mixed* b) {
+    return a[0]*b[0] + a[1]*b[1] + a[2]*b[2];
+}
+
+/** The position of a particle; returns its charge, which lies beside it. */
+inline DEVICE real loadPosition(GLOBAL const real4* RESTRICT posq, GLOBAL const real4* RESTRICT posqCorrection, int i, mixed* x) {
+    real4 p = posq[i];
+#ifdef USE_MIXED_PRECISION
+    real4 d = posqCorrection[i];
+    x[0] = p.x + (mixed) d.x;
+    x[1] = p.y + (mixed) d.y;
+    x[2] = p.z + (mixed) d.z;
+#else
+    x[0] = p.x;
+    x[1] = p.y;
+    x[2] = p.z;
+#endif
+    return p.w;
+}
+
+inline DEVICE void storePosition(GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, int i, mixed x, mixed y, mixed z, real q) {
+    posq[i] = make_real4((real) x, (real) y, (real) z, q);
+#ifdef USE_MIXED_PRECISION
+    posqCorrection[i] = make_real4((real) (x - (real) x), (real) (y - (real) y), (real) (z - (real) z), 0);
+#endif
+}
+
+/** The velocity of a particle; returns its inverse mass, which lies beside it. */
+inline DEVICE mixed loadVelocity(GLOBAL const mixed4* RESTRICT velm, int i, mixed* v) {
+    mixed4 p = velm[i];
+    v[0] = p.x;
+    v[1] = p.y;
+    v[2] = p.z;
+    return p.w;
+}
+
+/** The acceleration M^-1 F of a particle of inverse mass w; returns |F|^2. */
+inline DEVICE mixed loadAcceleration(GLOBAL const mm_long* RESTRICT force, int paddedNumAtoms, int i, mixed w, mixed* a) {
+    const mixed scale = 1/(mixed) 0x100000000;
+    mixed square = 0;
+    UNROLL for (int d = 0; d < 3; d++) {
+        mixed f = scale*force[i + d*paddedNumAtoms];
+        a[d] = w*f;
+        square += f*f;
+    }
+    return square;
+}
+
+// ---------------------------------------------------------------------------------------------------------------- the monitors
+
+POWER_FUNCTIONS
+
+/** Add what one constraint gives to the sums of the monitors: lambda is that of g = (|r|^2 - L^2)/2, rightSide is K lambda. */
+inline DEVICE void addConstraintTerms(mixed* sums, mixed lambda, mixed rightSide) {
+    CONSTRAINT_TERMS
+}
+
+/** The same for a particle with inverse mass w. */
+inline DEVICE void addParticleTerms(mixed* sums, mixed forceSquared, mixed w, const mixed* v) {
+    PARTICLE_TERMS
+}
+
+inline DEVICE void mergeSums(mixed* sums, const mixed* other) {
+    MERGE_TERMS
+}
+
+/** u = B(combination of U_k/U_k,ref) (docs/method.md, sections 4 and 6) from the sums; -1 if a monitor is no number. */
+inline DEVICE wide evaluateMonitors(const mixed* sums, wide groupEnergy, GLOBAL const wide* RESTRICT settings, wide* values) {
+    MONITOR_VALUES
+    wide sum = 0, weights = 0;
+    bool valid = true;
+    for (int k = 0; k < NUM_MONITORS; k++) {
+        GLOBAL const wide* term = settings + FIRST_TERM + 3*k;
+        const wide ratio = values[k]/term[2];
+        const wide t = term[0]*(term[1] == 1 ? ratio : pow(ratio, term[1]));
+        sum += t*t;
+        weights += term[0]*term[0];
+        valid = valid && values[k] >= 0 && values[k] < (wide) 1e37f;
+    }
+    const wide u = (NUM_MONITORS > 0 ? sqrt(sum/weights) : (wide) 1);
+    return valid ? (settings[LOWER] + settings[SLOPE]*u)/(1 + settings[CURVE]*u) : (wide) -1;
+}
+
+/** Merge the sums of all threads of a work group; thread 0 gets the result. */
+inline DEVICE void mergeInGroup(mixed* sums, LOCAL_ARG mixed* buffer) {
+    for (int j = 0; j < NUM_SUMS; j++)
+        buffer[j*GROUP_SIZE + LOCAL_ID] = sums[j];
+    for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
+        SYNC_THREADS;
+        if (LOCAL_ID < width) {
+            mixed other[NUM_SUMS];
+            for (int j = 0; j < NUM_SUMS; j++)
+                other[j] = buffer[j*GROUP_SIZE + LOCAL_ID + width];
+            mergeSums(sums, other);
+            for (int j = 0; j < NUM_SUMS; j++)
+                buffer[j*GROUP_SIZE + LOCAL_ID] = sums[j];
+        }
+    }
+    SYNC_THREADS;
+}
+
+/** Merge the sums that the work groups have left: the same in every work group, bit by bit. */
+inline DEVICE void gatherSums(int numPartials, GLOBAL const mixed* RESTRICT partials, mixed* sums, LOCAL_ARG mixed* buffer) {
+    for (int j = 0; j < NUM_SUMS; j++)
+        sums[j] = 0;
+    for (int i = LOCAL_ID; i < numPartials; i += GROUP_SIZE) {
+        mixed other[NUM_SUMS];
+        for (int j = 0; j < NUM_SUMS; j++)
+            other[j] = partials[j*numPartials + i];
+        mergeSums(sums, other);
+    }
+    mergeInGroup(sums, buffer);
+}
+
+// -------------------------------------------------------------------------------------------------------------- the step density
+
+/** f(rho) = (rho - a) - (1 - a)^2/(rho - a) and its inverse (docs/method.md, section 3). */
+inline DEVICE wide stretch(wide rho, wide a) {
+    return rho - a - (1 - a)*(1 - a)/(rho - a);
+}
+
+inline DEVICE wide unstretch(wide y, wide a) {
+    const wide c = 1 - a, root = sqrt(y*y + 4*c*c);
+    return a + (y > 0 ? (y + root)/2 : 2*c*c/(root - y));
+}
+
+inline DEVICE wide boundedUpdate(wide u, wide rho, wide a) {
+    const wide least = a + (wide) BOUND_MARGIN*(1 - a);
+    return unstretch(2*stretch(max(u, least), a) - stretch(max(rho, least), a), a);
+}
+
+/** The density of the next step where it follows from what is known on the step: the updates Explicit (3.15) and Bounded. */
+inline DEVICE wide nextDensity(wide u, const wide* now, GLOBAL const wide* RESTRICT settings) {
+#if UPDATE == FIXED
+    return 1;
+#elif UPDATE == BOUNDED
+    return boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
+#else
+    return 2*u - now[DENSITY];
+#endif
+}
+
+/** Enter a step with the density rho into a control block. */
+inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL const wide* RESTRICT settings) {
+    const wide previous = now[DENSITY], full = settings[NOMINAL]/rho;
+    const bool isShortened = (full > maxStep || fabs(full - maxStep) <= (wide) SLIVER*full);
+    now[STEP_SIZE] = (isShortened ? maxStep : full);
+    now[DENSITY] = (isShortened ? previous + (rho - previous)*min((wide) 1, maxStep/full) : rho);
+    now[DENSITY_OFFSET] = (isShortened ? now[DENSITY_OFFSET] : rho - (2*u - previous));
+    now[IS_SHORTENED] = (isShortened ? 1 : 0);
+    now[IS_HALF_KNOWN] = 0;
+    now[STEPS] += 1;
+    // The time in two numbers, so that a float loses none of it.
+    const wide step = now[STEP_SIZE] + now[ELAPSED_REST], sum = now[ELAPSED] + step;
+    now[ELAPSED_REST] = step - (sum - now[ELAPSED]);
+    now[ELAPSED] = sum;
+}
+
+// A failure is written down as the number of its step and a code, and from then on no launch of a later step does anything. The
+// launches of the same step may see it come or not: what they write is put back.
+#define IS_FROZEN(failure, step) ((failure)[0] != 0 && (failure)[0] != (step))
+
+inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
+    failure[0] = step;
+    failure[1] = code;
+}
+
+#define STATE_PARAMETERS int numSlots, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed* RESTRICT lengths, \
+        GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, \
+        GLOBAL mixed* RESTRICT multipliers, GLOBAL int* RESTRICT failure
+#define CLUSTER_PARAMETERS int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed* RESTRICT lengths, \
+        GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, \
+        GLOBAL mixed* RESTRICT multipliers
+#define CLUSTER_ARGUMENTS paddedNumAtoms, atoms, lengths, posq, posqCorrection, velm, force, multipliers
+
+CLUSTER_FUNCTIONS
+
+// ------------------------------------------------------------------------------------------------------------------- the kernels
+
+/**
+ * The second half of a step, after its forces (3.12)-(3.13): on-step velocities, Lambda, and the sums of the monitors there; where
+ * the update needs them also those at the half-step velocities, behind the others.
+ *
+ * kick is 1/2 for a step. A state changed by others takes 0, and isFormed: the half-step velocities are then formed from the
+ * on-step ones. Without isStored the velocities are left as they are.
+ */
+KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
+        GLOBAL mixed* RESTRICT partials, STATE_PARAMETERS) {
+    LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    const mixed dt = (mixed) control[STEP_SIZE];
+    // After a shortened step the half-step velocities are formed anew, as those of a step of the density that goes on.
+    const bool formHalf = (isFormed || control[IS_SHORTENED] != 0);
+    const mixed halfKick = (mixed) (settings[NOMINAL]/(2*control[DENSITY]));
+    mixed sums[NUM_SUMS];
+    for (int j = 0; j < NUM_SUMS; j++)
+        sums[j] = 0;
+#if HALF_SUMS
+    mixed halfSums[NUM_SUMS];
+    for (int j = 0; j < NUM_SUMS; j++)
+        halfSums[j] = 0;
+#else
+    mixed* halfSums = 0;
+#endif
+    const int end = (failure[0] != 0 ? 0 : numSlots);
+    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+        bool isRegular = true;
+        FINISH_CASES
+        if (!isRegular)
+            fail(failure, step, DEPENDENT_CONSTRAINTS + NUM_CODES*slot);
+    }
+    mergeInGroup(sums, buffer);
+    if (LOCAL_ID == 0)
+        for (int j = 0; j < NUM_SUMS; j++)
+            partials[j*NUM_GROUPS + GROUP_ID] = sums[j];
+#if HALF_SUMS
+    SYNC_THREADS;
+    mergeInGroup(halfSums, buffer);
+    if (LOCAL_ID == 0)
+        for (int j = 0; j < NUM_SUMS; j++)
+            partials[(NUM_SUMS + j)*NUM_GROUPS + GROUP_ID] = halfSums[j];
+#endif
+}
+
+/**
+ * Evaluate the monitors at the on-step state, for the host to read; of one work group. With isRescaled, after a jump of the state,
+ * the density keeps its ratio to u. A monitor that is no number makes the step that has led here fail.
+ */
+KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
+        GLOBAL const mixed* RESTRICT partials, GLOBAL int* RESTRICT failure) {
+    LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    wide values[NUM_VALUES];
+    gatherSums(numPartials, partials, sums, buffer);
+#if HALF_SUMS
+    SYNC_THREADS;
+    gatherSums(numPartials, partials + NUM_SUMS*numPartials, halfSums, buffer);
+#endif
+    if (LOCAL_ID == 0 && failure[0] == 0) {
+#if HALF_SUMS
+        if (control[IS_HALF_KNOWN] == 0)
+            control[HALF_U] = evaluateMonitors(halfSums, groupEnergy, settings, values);
+#endif
+        const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+        if (u < 0)
+            fail(failure, step, INVALID_MONITOR);
+        else {
+            if (isRescaled && u > 0 && control[MONITOR_U] > 0)
+                control[DENSITY] *= u/control[MONITOR_U];
+            control[MONITOR_U] = u;
+            for (int k = 0; k < NUM_MONITORS; k++)
+                control[FIRST_VALUE + k] = values[k];
+        }
+    }
+}
+
+#if HALF_SUMS
+
+/**
+ * What the trial of a density tells: the mismatch of (3.14) at it, and the next density to try by the secant method, whose slope is
+ * 1 but for terms of order h. Returns false if there is none.
+ */
+inline DEVICE bool judgeTrial(wide uTrial, wide* trial, GLOBAL const wide* RESTRICT settings) {
+    const wide rho = trial[TRIAL_DENSITY], mismatch = rho + trial[TRIAL_PREVIOUS] - uTrial - trial[TRIAL_HALF_U];
+    const wide change = rho - trial[TRIAL_LAST_DENSITY];
+    wide slope = (trial[TRIAL_COUNT] > 0 && change != 0 ? (mismatch - trial[TRIAL_LAST_MISMATCH])/change : (wide) 1);
+    slope = (slope > (wide) 0.5f && slope < 2 ? slope : (wide) 1);
+    trial[TRIAL_LAST_DENSITY] = rho;
+    trial[TRIAL_LAST_MISMATCH] = mismatch;
+    trial[TRIAL_COUNT] += 1;
+    if (!(uTrial >= 0))
+        return false;
+    if (fabs(mismatch) <= settings[DENSITY_TOLERANCE]*(rho + trial[TRIAL_PREVIOUS]))
+        trial[TRIAL_STATUS] = CONVERGED;
+    trial[TRIAL_DENSITY] = rho - mismatch/slope;
+    return trial[TRIAL_DENSITY] > 0;
+}
+
+/**
+ * One iteration for (3.14), rho[n+1/2] + rho[n-1/2] = u(q[n],p[n+1/2]) + u(q[n],p[n-1/2]): judge the last trial, and solve the
+ * constraints for the next density. Once it has converged nothing is done.
+ */
+KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int numPartials, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
+        GLOBAL const mixed* RESTRICT partials, GLOBAL const wide* RESTRICT lastTrial, GLOBAL const mixed* RESTRICT lastPartials,
+        GLOBAL wide* RESTRICT nextTrial, GLOBAL mixed* RESTRICT nextPartials, STATE_PARAMETERS) {
+    LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    LOCAL wide shared[2];
+    mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    const bool isFrozen = IS_FROZEN(failure, step);
+    gatherSums(numPartials, index == 0 ? partials : lastPartials, sums, buffer);
+    SYNC_THREADS;
+    gatherSums(numPartials, partials + NUM_SUMS*numPartials, halfSums, buffer);
+    if (LOCAL_ID == 0) {
+        wide trial[TRIAL_SIZE], values[NUM_VALUES];
+        for (int i = 0; i < TRIAL_SIZE; i++)
+            trial[i] = (index == 0 ? (wide) 0 : lastTrial[i]);
+        if (index == 0) {
+            const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+            trial[TRIAL_U] = u;
+            trial[TRIAL_PREVIOUS] = control[DENSITY];
+            trial[TRIAL_HALF_U] = (control[IS_HALF_KNOWN] != 0 ? control[HALF_U] : evaluateMonitors(halfSums, groupEnergy, settings, values));
+            trial[TRIAL_DENSITY] = 2*u - control[DENSITY] + control[DENSITY_OFFSET];
+            trial[TRIAL_STATUS] = (u >= 0 && trial[TRIAL_HALF_U] >= 0 && trial[TRIAL_DENSITY] > 0 ? TRYING : UNSOLVED);
+        }
+        else if (trial[TRIAL_STATUS] == TRYING && !judgeTrial(sums[FAILURES] > 0 ? (wide) -1 : evaluateMonitors(sums, groupEnergy, settings, values), trial, settings))
+            trial[TRIAL_STATUS] = UNSOLVED;
+        shared[0] = (trial[TRIAL_STATUS] == TRYING && !isFrozen ? settings[NOMINAL]/trial[TRIAL_DENSITY] : (wide) -1);
+        if (GROUP_ID == 0)
+            for (int i = 0; i < TRIAL_SIZE; i++)
+                nextTrial[i] = trial[i];
+    }
+    SYNC_THREADS;
+    const mixed dt = (mixed) shared[0];
+    for (int j = 0; j < NUM_SUMS; j++)
+        sums[j] = 0;
+    const int end = (dt > 0 ? numSlots : 0);
+    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+        bool isSolved = true;
+        TRIAL_CASES
+        if (!isSolved)
+            sums[FAILURES] += 1;
+    }
+    mergeInGroup(sums, buffer);
+    if (LOCAL_ID == 0)
+        for (int j = 0; j < NUM_SUMS; j++)
+            nextPartials[j*NUM_GROUPS + GROUP_ID] = sums[j];
+}
+
+#endif
+
+/**
+ * The first half of a step (3.9)-(3.11): every work group finds the density for itself, group 0 writes it into the other half of
+ * the control block; then kick, drift and the constraints of the positions. The state before goes to a copy.
+ */
+KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed tolerance, int numPartials, GLOBAL const wide* RESTRICT control, GLOBAL wide* RESTRICT nextControl,
+        GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials, GLOBAL const wide* RESTRICT lastTrial, GLOBAL const mixed* RESTRICT lastPartials,
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS) {
+    LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    LOCAL wide shared[2];
+    mixed sums[NUM_SUMS];
+    const bool isFrozen = IS_FROZEN(failure, step);
+#if HALF_SUMS
+    gatherSums(numPartials, lastPartials, sums, buffer);
+#else
+    gatherSums(numPartials, partials, sums, buffer);
+#endif
+    if (LOCAL_ID == 0) {
+        wide now[CONTROL_SIZE], values[NUM_VALUES];
+        for (int i = 0; i < CONTROL_SIZE; i++)
+            now[i] = control[i];
+#if HALF_SUMS
+        wide trial[TRIAL_SIZE];
+        for (int i = 0; i < TRIAL_SIZE; i++)
+            trial[i] = lastTrial[i];
+        const wide u = trial[TRIAL_U];
+        if (trial[TRIAL_STATUS] == TRYING)
+            judgeTrial(sums[FAILURES] > 0 ? (wide) -1 : evaluateMonitors(sums, groupEnergy, settings, values), trial, settings);
+        wide rho = (trial[TRIAL_STATUS] == CONVERGED ? trial[TRIAL_DENSITY] : (wide) -1);
+#else
+        const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+        wide rho = nextDensity(u, now, settings);
+#endif
+#if UPDATE != FIXED && UPDATE != BOUNDED
+        // A rescue: the sum gave no step, or one far above the maximum.
+        if (!(rho > 0) || rho < settings[SMALLEST]/2) {
+            rho = boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
+            now[RESCUES] += 1;
+        }
+#endif
+        enterStep(rho, u, maxStep, now, settings);
+        const bool isValid = (u >= 0 && now[STEP_SIZE] < (wide) 1e30f);
+        shared[0] = (isValid && !isFrozen ? now[STEP_SIZE] : (wide) -1);
+        if (GROUP_ID == 0 && !isFrozen) {
+            if (isValid)
+                for (int i = 0; i < CONTROL_SIZE; i++)
+                    nextControl[i] = now[i];
+            else // the state at the end of the step before is no good
+                fail(failure, step - 1, INVALID_MONITOR);
+        }
+    }
+    SYNC_THREADS;
+    const mixed dt = (mixed) shared[0];
+    const int end = (dt >= 0 ? numSlots : 0);
+    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+        int iterations = 0;
+        ADVANCE_CASES
+        if (iterations < 0)
+            fail(failure, step, NOT_CONVERGED + NUM_CODES*slot);
+        iterationCounts[GLOBAL_ID] += iterations;
+    }
+}
+
+/** Put the state before the last step back. */
+KERNEL void restoreState(int numAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm,
+        GLOBAL const mixed4* RESTRICT oldPositions, GLOBAL const mixed4* RESTRICT oldVelocities) {
+    for (int i = GLOBAL_ID; i < numAtoms; i += GLOBAL_SIZE)
+        if (velm[i].w != 0) {
+            mixed4 p = oldPositions[i];
+            storePosition(posq, posqCorrection, i, p.x, p.y, p.z, (real) p.w);
+            velm[i] = oldVelocities[i];
+        }
+}

@@ -1,0 +1,51 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
+// with graphs "common" (hydrogens on heavy atoms, rigid water) or "all" (of up to eight constraints, the densest among them).
+
+#include "StepProgram.h"
+#include "TestSupport.h"
+#include <fstream>
+
+using namespace OpenMMVRattle;
+using std::string;
+using std::vector;
+
+int main(int argc, char** argv) {
+    if (argc != 5) {
+        std::cerr << "PrintKernels <precision> <monitor> <update> common|all" << std::endl;
+        return 2;
+    }
+    const string precision = argv[1], graphs = argv[4];
+    OpenMM::System system;
+    auto add = [&](const vector<std::pair<int, int>>& pairs) {
+        const int first = system.getNumParticles();
+        int numAtoms = 1;
+        for (const auto& pair : pairs)
+            numAtoms = std::max(numAtoms, std::max(pair.first, pair.second) + 1);
+        for (int i = 0; i < numAtoms; i++)
+            system.addParticle(12);
+        for (const auto& pair : pairs)
+            system.addConstraint(first + pair.first, first + pair.second, 0.1);
+    };
+    add({});
+    add({{0, 1}});
+    add({{0, 1}, {0, 2}});
+    add({{0, 1}, {0, 2}, {0, 3}});
+    add({{0, 1}, {0, 2}, {1, 2}});
+    if (graphs == "all") {
+        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}});
+        add({{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}});
+        add({{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}, {6, 7}, {7, 8}});
+        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}, {0, 7}, {0, 8}});
+        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {1, 2}, {2, 3}, {3, 4}, {4, 1}});
+    }
+    const vector<StepMonitor::Term> terms = {{(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1}};
+    const StepDensity::Update update = (StepDensity::Update) std::stoi(argv[3]);
+    const StepProgram program(ClusterKinds::find(system), terms, StepProgram::updateOf(terms, false, update),
+                              precision != "single", true);
+    for (const auto& define : program.getDefines())
+        std::cout << "#define " << define.first << " " << define.second << "\n";
+    std::cout << program.getSource();
+}

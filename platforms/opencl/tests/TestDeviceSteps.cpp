@@ -1,0 +1,355 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// The steps on a device against VRattleDynamics, from the same state in the middle of a run.
+
+#include "DeviceSteps.h"
+#include "TestSupport.h"
+#include "openmm/Context.h"
+#include "openmm/CustomExternalForce.h"
+#include "openmm/HarmonicBondForce.h"
+#include "openmm/Integrator.h"
+#include "openmm/internal/ContextImpl.h"
+#include "openmm/opencl/OpenCLPlatform.h"
+#include "step/VRattleDynamics.h"
+#include <cmath>
+#include <memory>
+#include <random>
+
+using namespace OpenMMVRattle;
+using OpenMM::Context;
+using OpenMM::ContextImpl;
+using OpenMM::System;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+// An integrator that lends its Context.
+class Lender : public OpenMM::Integrator {
+public:
+    ContextImpl& getContext() {
+        return *context;
+    }
+    OpenMM::ComputeContext& getDevice() {
+        auto* data = static_cast<OpenMM::OpenCLPlatform::PlatformData*>(context->getPlatformData());
+        return *reinterpret_cast<OpenMM::ComputeContext*>(data->contexts[0]);
+    }
+    void step(int) override {
+    }
+
+protected:
+    void initialize(ContextImpl& contextRef) override {
+        context = &contextRef;
+        owner = &contextRef.getOwner();
+        getDevice().initializeContexts();
+    }
+    vector<std::string> getKernelNames() override {
+        return {};
+    }
+    double computeKineticEnergy() override {
+        return 0;
+    }
+};
+
+// Clusters of many graphs, and free particles, in a field that ties them together.
+struct Molecules {
+    System system;
+    vector<Vec3> positions, velocities;
+    vector<double> masses;
+    vector<DistanceConstraint> constraints;
+    std::mt19937 random;
+
+    explicit Molecules(int copies) : random(7) {
+        auto* field = new OpenMM::CustomExternalForce("200*(x^2+y^2+z^2)+80*cos(9*x)*sin(7*y+5*z)");
+        auto* bonds = new OpenMM::HarmonicBondForce();
+        const vector<vector<std::pair<int, int>>> graphs = {
+            {{0, 1}, {0, 2}, {1, 2}},                                                         // water
+            {{0, 1}},                                                                         // X-H
+            {{0, 1}, {0, 2}, {0, 3}},                                                         // XH3
+            {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}, {6, 7}, {7, 8}},                 // a chain
+            {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}},                                 // a rigid tetrahedron
+            {{0, 1}, {1, 2}, {2, 3}, {3, 0}, {0, 4}, {1, 5}},                                 // a ring with tails
+            {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}, {3, 4}, {4, 5}},                 // with a tail
+            {}};
+        std::uniform_real_distribution<double> uniform(-1, 1);
+        for (int copy = 0; copy < copies; copy++)
+            for (const auto& graph : graphs) {
+                int numAtoms = 1;
+                for (const auto& pair : graph)
+                    numAtoms = std::max(numAtoms, std::max(pair.first, pair.second) + 1);
+                const int first = system.getNumParticles();
+                const Vec3 centre(uniform(random), uniform(random), uniform(random));
+                for (int i = 0; i < numAtoms; i++) {
+                    // On a coil, so that no set of bonds is flat.
+                    const Vec3 place(0.1 * std::cos(1.9 * i), 0.1 * std::sin(1.9 * i), 0.04 * i + 0.02 * (i % 3));
+                    addParticle(i % 3 == 1 ? 1.0 : 12.0 + i, centre + place);
+                    field->addParticle(first + i);
+                }
+                for (const auto& pair : graph)
+                    addConstraint(first + pair.first, first + pair.second);
+                if (first > 0)
+                    bonds->addBond(first - 1, first, 0.5, 500);
+            }
+        addParticle(0, Vec3(0.1, 0.2, 0.3)); // does not move
+        auto* wells = new OpenMM::CustomExternalForce("0.01*x^2");
+        wells->addParticle(0);
+        wells->setForceGroup(1); // of the monitor
+        for (OpenMM::Force* force : std::initializer_list<OpenMM::Force*>{field, bonds, wells})
+            system.addForce(force);
+    }
+    void addParticle(double mass, const Vec3& position) {
+        std::normal_distribution<double> normal(0, mass > 0 ? std::sqrt(2.5 / mass) : 0.0);
+        system.addParticle(mass);
+        masses.push_back(mass);
+        positions.push_back(position);
+        velocities.push_back(Vec3(normal(random), normal(random), normal(random)));
+    }
+    void addConstraint(int i, int j) {
+        const Vec3 r = positions[i] - positions[j];
+        system.addConstraint(i, j, std::sqrt(r.dot(r)));
+        constraints.push_back({i, j, std::sqrt(r.dot(r))});
+    }
+};
+
+double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
+    double largest = 0;
+    for (size_t i = 0; i < a.size(); i++)
+        for (int j = 0; j < 3; j++)
+            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
+    return largest;
+}
+
+const double NO_LIMIT = std::numeric_limits<double>::infinity();
+
+// VRattleDynamics and DeviceSteps side by side; both get their forces from one Context on OpenCL.
+struct Both {
+    Lender lender;
+    Context context;
+    VRattleDynamics dynamics;
+    DeviceSteps device;
+    VRattleDynamics::Settings settings;
+
+    Both(const Molecules& molecules, const std::string& precision) :
+            context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
+            dynamics(molecules.masses, molecules.constraints), device(lender.getDevice(), molecules.system),
+            settings() {
+    }
+    // Some steps on the host, then the state goes to the device.
+    void start(const Molecules& molecules, StepDensity::Update update, const vector<StepMonitor::Term>& terms) {
+        const double h = 0.001;
+        settings = {h, h / 50, 2 * h, DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12), update, terms, false};
+        dynamics.setSettings(settings);
+        vector<Vec3> forces = forcesAt(molecules.positions);
+        dynamics.begin(molecules.positions, molecules.velocities, forces, groupEnergy());
+        for (int i = 0; i < 5; i++)
+            stepOnHost();
+        handOver();
+    }
+    void handOver() {
+        const VRattleDynamics::Memory memory = dynamics.getMemory();
+        const double energy = groupEnergyAt(dynamics.getPositions());
+        computeForces();
+        context.setVelocities(dynamics.getVelocities());
+        vector<StepMonitor::Term> terms = settings.terms;
+        for (size_t k = 0; k < terms.size(); k++)
+            terms[k].reference = memory.references[k];
+        device.setSettings({settings.stepSize,
+                            StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
+                            settings.update, false, settings.tolerance, terms});
+        ASSERT(device.begin({memory.density, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue},
+                            energy));
+    }
+    // To be asked for before the forces, which it overwrites.
+    double groupEnergy() {
+        return 2.5 + lender.getContext().calcForcesAndEnergy(false, true, 2);
+    }
+    double groupEnergyAt(const vector<Vec3>& positions) {
+        context.setPositions(positions);
+        return groupEnergy();
+    }
+    void computeForces() {
+        lender.getContext().calcForcesAndEnergy(true, false, 1);
+    }
+    vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+        context.setPositions(positions);
+        computeForces();
+        vector<Vec3> forces;
+        lender.getContext().getForces(forces);
+        return forces;
+    }
+    void stepOnHost(double maxStep = NO_LIMIT) {
+        vector<Vec3> forces;
+        do {
+            dynamics.step(maxStep);
+            forces = forcesAt(dynamics.getNextPositions());
+        } while (!dynamics.finish(forces, groupEnergyAt(dynamics.getNextPositions())));
+    }
+    void stepOnDevice(double maxStep = NO_LIMIT) {
+        device.advance(maxStep);
+        const double energy = groupEnergy();
+        computeForces();
+        device.finish(energy);
+    }
+    vector<Vec3> positions() {
+        return context.getState(OpenMM::State::Positions).getPositions();
+    }
+    vector<Vec3> velocities() {
+        return context.getState(OpenMM::State::Velocities).getVelocities();
+    }
+    // The states of both are the same: to a distance (nm) and velocity (nm/ps), monitors and density to a fraction.
+    void requireAgreement(const DeviceSteps::Report& report, double distance, double speed, double fraction) {
+        ASSERT(!report.hasFailed);
+        ASSERT_EQUAL(0, report.numRescues);
+        ASSERT(largestDifference(positions(), dynamics.getPositions()) <= distance);
+        ASSERT(largestDifference(velocities(), dynamics.getVelocities()) <= speed);
+        for (size_t k = 0; k < settings.terms.size(); k++)
+            ASSERT_EQUAL_TOL(dynamics.getMonitorValues()[k], report.values[k], fraction);
+        ASSERT_EQUAL_TOL(dynamics.getDensity(), report.state.density, fraction);
+    }
+};
+
+vector<StepMonitor::Term> allMonitors() {
+    vector<StepMonitor::Term> terms;
+    for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
+        terms.push_back({(StepMonitor::Kind) kind, 1 + 0.1 * kind, kind % 2 == 0 ? 1.0 : 0.7, 0.0, 8.0});
+    terms.push_back({StepMonitor::ForcePNorm, 1.0, 1.0, 0.0, 2.5});
+    return terms;
+}
+
+// From a state in the middle of a run: the first step, and 20, of which the last is cut short.
+void testStepsAgree(const std::string& precision, const vector<StepDensity::Update>& updates, double distance,
+                    double fraction) {
+    const Molecules molecules(2);
+    Both both(molecules, precision);
+    for (StepDensity::Update update : updates) {
+        both.start(molecules, update, allMonitors());
+        for (int i = 0; i < 20; i++) {
+            both.stepOnDevice(i == 18 ? 0.0004 : NO_LIMIT);
+            if (i == 0 || i == 18 || i == 19) {
+                const DeviceSteps::Report report = both.device.read();
+                ASSERT_EQUAL(i == 0 ? 1 : i == 18 ? 18 : 1, report.numSteps);
+                const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+                for (int j = 0; j < report.numSteps; j++)
+                    both.stepOnHost(i == 18 && j == report.numSteps - 1 ? 0.0004 : NO_LIMIT);
+                both.context.setPositions(positions);
+                both.context.setVelocities(velocities);
+                both.computeForces();
+                const double growth = i == 0 ? 1 : 100;
+                both.requireAgreement(report, growth * distance, 1000 * growth * distance, growth * fraction);
+            }
+        }
+        ASSERT(both.device.getNumIterations() >= 20);
+    }
+}
+
+// Velocities that have been changed are projected, and the density keeps its ratio to u.
+void testChangedVelocities() {
+    const Molecules molecules(2);
+    Both both(molecules, "double");
+    for (StepDensity::Update update : {StepDensity::SemiExplicit, StepDensity::Explicit}) {
+        both.start(molecules, update, allMonitors());
+        vector<Vec3> velocities = both.velocities();
+        for (size_t i = 0; i < velocities.size(); i++)
+            if (molecules.masses[i] > 0)
+                velocities[i] += Vec3(0.1 * std::sin(i), 0.2 * std::cos(i), -0.1);
+        both.dynamics.changeVelocities(velocities);
+        both.context.setVelocities(velocities);
+        const double energy = both.groupEnergy();
+        both.computeForces();
+        ASSERT(both.device.change(energy));
+        both.requireAgreement(both.device.read(), 1e-13, 1e-10, 1e-9);
+        both.stepOnDevice();
+        const DeviceSteps::Report report = both.device.read();
+        const vector<Vec3> positions = both.positions(), after = both.velocities();
+        both.stepOnHost();
+        both.context.setPositions(positions);
+        both.context.setVelocities(after);
+        // The device forms the half-step momentum anew, with the scaled density; the host changes its own.
+        both.requireAgreement(report, 1e-6, 1e-4, 1e-4);
+    }
+}
+
+// A cluster that cannot be solved in step 31 of 60, beside others that can: a dumbbell that flies into a wall.
+void testFailureLeavesTheStateBefore(const std::string& precision) {
+    Molecules molecules(1);
+    const int first = molecules.system.getNumParticles();
+    molecules.addParticle(12, Vec3(3, 0, 0));
+    molecules.addParticle(12, Vec3(3, 0.1, 0));
+    molecules.addConstraint(first, first + 1);
+    for (int i = 0; i < 2; i++)
+        molecules.velocities[first + i] = Vec3(1, 0, 0);
+    // The wall is reached in the 30th step of 0.001 ps, and pushes in the next one.
+    auto* wall = new OpenMM::CustomExternalForce("1e9*x*step(x-3.0295)");
+    wall->addParticle(first);
+    molecules.system.addForce(wall);
+    Both both(molecules, precision);
+    both.settings = {0.001, 0, 0, 1e-5, StepDensity::Explicit, {}, false};
+    both.dynamics.setSettings(both.settings);
+    vector<Vec3> forces = both.forcesAt(molecules.positions);
+    both.dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
+    vector<Vec3> positions[2], velocities[2];
+    for (int attempt = 0; attempt < 2; attempt++) {
+        both.context.setPositions(both.dynamics.getPositions());
+        both.context.setVelocities(both.dynamics.getVelocities());
+        both.computeForces();
+        both.device.setSettings(
+            {0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-5, {}});
+        ASSERT(both.device.begin({1, 0, false, 0}, 0));
+        for (int i = 0; i < (attempt == 0 ? 30 : 60); i++)
+            both.stepOnDevice();
+        const DeviceSteps::Report report = both.device.read();
+        ASSERT_EQUAL(attempt == 1, report.hasFailed);
+        ASSERT_EQUAL(30, report.numSteps);
+        ASSERT_EQUAL_TOL(0.030, report.elapsed, 1e-6);
+        positions[attempt] = both.positions();
+        velocities[attempt] = both.velocities();
+    }
+    ASSERT_EQUAL(0.0, largestDifference(positions[0], positions[1]));
+    ASSERT_EQUAL(0.0, largestDifference(velocities[0], velocities[1]));
+    // And it goes on from there where there is no wall, which has pushed already.
+    for (int i = first; i < first + 2; i++) {
+        positions[1][i] -= Vec3(1, 0, 0);
+        velocities[1][i] = Vec3(1, 0, 0);
+    }
+    both.context.setPositions(positions[1]);
+    both.context.setVelocities(velocities[1]);
+    both.computeForces();
+    ASSERT(both.device.begin({1, 0, false, 0}, 0));
+    for (int i = 0; i < 10; i++)
+        both.stepOnDevice();
+    const DeviceSteps::Report report = both.device.read();
+    ASSERT(!report.hasFailed);
+    ASSERT_EQUAL(10, report.numSteps);
+}
+
+void testLargeClustersAreRefused() {
+    System system;
+    for (int i = 0; i < 10; i++) {
+        system.addParticle(12);
+        if (i > 0)
+            system.addConstraint(i - 1, i, 0.1);
+    }
+    assertThrows("a cluster of 9 coupled constraints", [&] { ClusterKinds::find(system); });
+}
+
+} // namespace
+
+int main(int argc, char** argv) {
+    OpenMM::Platform::loadPluginsFromDirectory(OpenMM::Platform::getDefaultPluginsDirectory());
+    TestList tests = {
+        {"steps agree, double",
+         [] {
+             testStepsAgree("double", {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded}, 1e-12,
+                            1e-9);
+         }},
+        {"steps agree, mixed", [] { testStepsAgree("mixed", {StepDensity::SemiExplicit}, 1e-9, 1e-6); }},
+        {"steps agree, single", [] { testStepsAgree("single", {StepDensity::SemiExplicit}, 1e-6, 1e-4); }},
+        {"changed velocities", testChangedVelocities},
+        {"a failure leaves the state before, double", [] { testFailureLeavesTheStateBefore("double"); }},
+        {"a failure leaves the state before, single", [] { testFailureLeavesTheStateBefore("single"); }},
+        {"large clusters are refused", testLargeClustersAreRefused}};
+    if (argc > 1)
+        tests = {tests.at(std::stoi(argv[1]))};
+    return runTests(tests);
+}
