@@ -108,7 +108,7 @@ conda: $(PACKAGE_TOOLS)
 
 # Always run: pip knows better than make what has changed. The build itself happens in an environment of its own.
 install: $(BIN)/python
-	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m pip install .
+	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m pip install ".[compare]"
 
 format: $(TOOLS)
 	$(BIN)/ruff check --fix .

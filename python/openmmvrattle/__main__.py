@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import openmm
 
 from . import info
+from .compare import MissingPackageError
 from .compare.commands import advise, compare
 from .compare.commands.systems import UsageError
 
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         return options.run(options)
-    except UsageError as error:
+    except (UsageError, MissingPackageError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

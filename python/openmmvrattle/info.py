@@ -13,7 +13,7 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import openmm
@@ -140,42 +140,40 @@ def _problem(make: Callable[[], openmm.Integrator], on: openmm.Platform) -> str 
 
 
 def _print(content: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    versions = Table(title="Versions", title_justify="left", show_header=False)
-    for name, version in content["versions"].items():
-        versions.add_row(name, version)
-    console.print(versions)
-    platforms = Table(title="Where the integrators run", title_justify="left")
-    platforms.add_column("platform")
+    print("Versions")
+    _print_columns(content["versions"].items())
+    print("\nWhere the integrators run")
     names = list(next(iter(content["platforms"].values()), {}))
-    for name in names:
-        platforms.add_column(name, overflow="fold")
+    rows = [("platform", *names)]
+    remarks = []
     for name, problems in content["platforms"].items():
-        platforms.add_row(name, *(_answer(problem) for problem in problems.values()))
-    console.print(platforms)
+        rows.append((name, *("yes" if problem is None else "no" for problem in problems.values())))
+        remarks += [f"- {each} on {name}: {problem}" for each, problem in problems.items() if problem is not None]
+    _print_columns(rows)
+    if remarks:
+        print("\nWhat OpenMM says where they do not")
+    for remark in remarks:
+        print(remark)
     for whose, failures in content["plugin_load_failures"].items():
         if failures:
-            console.print(f"Libraries of {whose} that could not be loaded:", style="bold")
+            print(f"\nLibraries of {whose} that could not be loaded")
         for failure in failures:
-            console.print(f"- {' '.join(failure.split())}", soft_wrap=True, markup=False, highlight=False)
+            print(f"- {' '.join(failure.split())}")
         if failures and whose == "OpenMM":
-            console.print("They matter only for the platforms that they belong to.")
+            print("They matter only for the platforms that they belong to.")
     if content["healthy"]:
-        console.print("All is well.", style="bold green")
+        print("\nAll is well.")
     else:
-        console.print(
-            f"Something is wrong: install the package anew (pip install --force-reinstall openmm-vrattle); it lies in "
-            f"{content['folder']}.",
-            style="bold red",
-            soft_wrap=True,
-            markup=False,
+        print(
+            "\nSomething is wrong: install the package anew (pip install --force-reinstall openmm-vrattle); it lies in "
+            f"{content['folder']}."
         )
 
 
-def _answer(problem: str | None) -> str:
-    from rich.markup import escape
-
-    return "[green]yes[/green]" if problem is None else f"no: {escape(problem)}"
+def _print_columns(rows: Iterable[Sequence[str]]) -> None:
+    """Print cells below each other."""
+    rows = list(rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print("  " + "  ".join(cells).rstrip())

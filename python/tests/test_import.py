@@ -128,3 +128,68 @@ def test_a_broken_library_is_reported(tmp_path):
 def test_a_library_for_a_missing_platform_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(openmmvrattle, "_PLATFORMS_OF_LIBRARY", {"OpenMMVRattleNowhere": ("Nowhere",)})
     assert openmmvrattle._load_plugins(tmp_path) == []
+
+
+WITHOUT = "import sys\nfor name in ('matplotlib', 'rich', 'distributed', 'pandas'): sys.modules[name] = None\n"
+
+
+def test_openmm_and_numpy_are_enough(tmp_path):
+    """The integrators, their reporters, the test systems, advice and info; what needs more says so in one sentence."""
+    script = WITHOUT + (
+        "import openmmvrattle, openmmvrattle.reporters\n"
+        "from openmmvrattle.testsystems import double_pendulum\n"
+        "p = double_pendulum()\n"
+        "a = openmmvrattle.advise(p.system, p.positions, p.velocities, step_size=1e-4, steps=50)\n"
+        "print(len(a.sentences()) > 0)\n"
+        "from openmmvrattle.__main__ import main\n"
+        "print(main(['info']))\n"
+    )
+    lines = run_script(script, cwd=tmp_path)
+    assert lines[0] == "True" and lines[-2:] == ["All is well.", "0"]
+
+
+@pytest.mark.parametrize(
+    "command, packages",
+    [
+        (["compare", "--quick", "--system", "double-pendulum"], "matplotlib and rich, which are"),
+        (["advise", "--system", "double-pendulum", "--steps", "50"], "rich, which is"),
+    ],
+)
+def test_a_command_says_which_package_is_missing(tmp_path, command, packages):
+    script = WITHOUT + f"from openmmvrattle.__main__ import main\nsys.exit(main({command!r}))\n"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr == (
+        f'error: this command needs {packages} not installed: pip install "openmm-vrattle[compare]" (or, in the folder '
+        'of the source, ".[compare]").\n'
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_pictures_and_clusters_say_which_package_is_missing():
+    script = WITHOUT + (
+        "from openmmvrattle.compare import sweep\n"
+        "try:\n    sweep.DaskRunner('tcp://127.0.0.1:1')\nexcept sweep.RunnerError as error:\n    print(error)\n"
+        "try:\n    import openmmvrattle.compare.plots\nexcept ImportError as error:\n    print(error)\n"
+    )
+    cluster, picture = run_script(script)
+    assert cluster.startswith("a Dask cluster needs distributed, which is not installed: pip install ")
+    assert picture.startswith("a picture needs matplotlib, which is not installed: pip install ")
+
+
+def test_old_names_of_modules_go_on_to_work():
+    script = (
+        "import warnings\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        "    from openmmvrattle.comparison import compare\n"
+        "    import openmmvrattle.measurement\n"
+        "import openmmvrattle.compare.comparison as new\n"
+        "print(compare is new.compare, openmmvrattle.measurement is openmmvrattle.compare.measurement)\n"
+        "print(*(str(w.message) for w in caught if w.category is DeprecationWarning), sep='\\n')\n"
+    )
+    assert run_script(script) == [
+        "True True",
+        "openmmvrattle.comparison is called openmmvrattle.compare.comparison now",
+        "openmmvrattle.measurement is called openmmvrattle.compare.measurement now",
+    ]

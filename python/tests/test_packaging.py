@@ -56,9 +56,12 @@ def test_conda_builds_with_what_pip_builds_with(recipe: dict) -> None:
 
 
 def test_conda_installs_what_pip_installs(recipe: dict) -> None:
+    """With what draws and prints comparisons, since conda has no extras; Dask is left to those who have a cluster."""
     wanted = requirements("project", "dependencies")
-    assert {"openmm", "numpy"} <= set(wanted)
-    assert conda_requirements(recipe, "run") == wanted | {"python": ""}
+    assert set(wanted) == {"openmm", "numpy"}
+    extra = requirements(r"project\.optional-dependencies", "compare")
+    del extra["distributed"]
+    assert conda_requirements(recipe, "run") == wanted | extra | {"python": ""}
 
 
 def test_the_tools_are_those_of_the_build() -> None:
@@ -70,3 +73,9 @@ def test_the_tools_are_those_of_the_build() -> None:
         name: version for name, version in tools.items() if name in build
     }
     assert requirements(r"project\.optional-dependencies", "test").items() <= tools.items()
+
+
+def test_tests_have_what_comparisons_need() -> None:
+    extra = requirements(r"project\.optional-dependencies", "compare")
+    assert set(extra) == {"matplotlib-base", "rich", "distributed"}
+    assert extra.items() <= requirements(r"project\.optional-dependencies", "test").items()

@@ -261,7 +261,7 @@ def test_the_command_line_on_a_cluster(cluster, tmp_path):
         *("--integrators", "RATTLE", "VRATTLE", "--scheduler", cluster.scheduler_address, "--output", str(tmp_path)),
     )
     assert result.returncode == 0, result.stderr
-    assert "2 worker(s)" in result.stdout
+    assert re.search(r"[12] worker\(s\)", result.stdout)  # the second may still be starting
     assert [row["name"] for row in rows_of(tmp_path)] == ["RATTLE, fixed steps", "VRATTLE, ForcePNorm^0.5"]
 
 
@@ -273,7 +273,7 @@ def test_no_scheduler():
 
 def test_dask_that_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(RunnerError, match=re.escape("pip install openmm-vrattle[dask]")):
+    with pytest.raises(RunnerError, match=re.escape('pip install "openmm-vrattle[compare]"')):
         DaskRunner("tcp://127.0.0.1:9")
 
 

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from . import require
 from .advice import Advice
 from .comparison import Comparison, envelope, two_digits
 from .measurement import IntegratorRun
+
+require("a picture", "matplotlib")
+from matplotlib.figure import Figure  # noqa: E402 - after the plain sentence for where it is missing
 
 __all__ = ["draw_comparison", "draw_trial", "save_comparison", "save_trial"]
 

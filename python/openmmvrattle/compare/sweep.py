@@ -18,6 +18,7 @@ from collections.abc import Callable, Generator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
+from . import MissingPackageError, require
 from .comparison import Case, Comparison, run_case
 from .measurement import IntegratorRun, failed_run
 
@@ -202,11 +203,11 @@ class DaskRunner:
             timeout: how long to wait for it, in seconds.
         """
         try:
-            from distributed import Client
-        except ImportError as error:
-            raise RunnerError(
-                "a Dask cluster needs the package distributed: pip install openmm-vrattle[dask]."
-            ) from error
+            require("a Dask cluster", "distributed")
+        except MissingPackageError as error:
+            raise RunnerError(str(error)) from error
+        from distributed import Client
+
         try:
             self._client = Client(address, timeout=timeout, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...testsystems import SYSTEMS, TestSystem
+from .. import require
 from .systems import (
     UsageError,
     add_system_arguments,
@@ -73,6 +74,7 @@ def add_parser(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Carry the command out and return the exit code."""
+    require("this command", "rich", *(["matplotlib"] if options.output is not None else []))
     from rich.console import Console
     from rich.progress import Progress
 

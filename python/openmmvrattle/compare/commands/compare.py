@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...testsystems import SYSTEMS, ComparisonSettings, StepControl, TestSystem
+from .. import require
 from .systems import (
     MONITORS,
     UPDATES,
@@ -147,7 +148,7 @@ def add_parser(commands: Any) -> None:
     where.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="run on the Dask cluster with this scheduler, such as tcp://host:8786 (pip install openmm-vrattle[dask])",
+        help="run on the Dask cluster with this scheduler, such as tcp://host:8786 (needs the extra `compare`)",
     )
     where.add_argument(
         "--output", type=Path, default=Path("out"), metavar="FOLDER", help="folder for the files (default: out)"
@@ -160,6 +161,7 @@ def add_parser(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Carry the command out and return the exit code."""
     _check(options)
+    require("this command", "matplotlib", "rich")
     from rich.console import Console
 
     from ..results import ResultFolder
