@@ -445,6 +445,7 @@ void VRattleDynamics::acceptAutomatic() {
 }
 
 void VRattleDynamics::reverse() {
+    ensureFactor(NoFactor);
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
         solveRegular();

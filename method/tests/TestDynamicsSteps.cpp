@@ -195,6 +195,56 @@ void testChangedFrame() {
     }
 }
 
+// A step that fails in its second half leaves nothing behind, whatever comes next: above all not the forces of where it failed.
+void testFailedSteps() {
+    for (const bool isGeneral : {false, true}) // small clusters in batches have no factor that is made anew
+        for (const auto update : {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded})
+            for (const auto kind : {StepMonitor::VectorField, StepMonitor::ConstraintAndAppliedForce,
+                                    StepMonitor::ArcLength, StepMonitor::ForcePNorm})
+                for (int next = 0; next < 5; next++) {
+                    Example e;
+                    for (int i = 0; i < 3; i++)
+                        e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}},
+                                     {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
+                    if (isGeneral)
+                        makeExample(e, 1);
+                    VRattleDynamics tried(e.masses, e.constraints), untried(e.masses, e.constraints);
+                    for (VRattleDynamics* dynamics : {&tried, &untried}) {
+                        VRattleDynamics::Settings settings = makeSettings(update);
+                        settings.terms[0].kind = kind;
+                        dynamics->setSettings(settings);
+                        run(*dynamics, e, 5);
+                        if (dynamics == &tried) {
+                            dynamics->step(INFINITY);
+                            vector<Vec3> forces = forcesAt(dynamics->getNextPositions());
+                            forces[0][1] = NAN;
+                            assertThrows("not a number", [&] { dynamics->finish(forces, 0); });
+                            dynamics->abandonStep();
+                        }
+                        vector<Vec3> velocities = dynamics->getVelocities();
+                        for (size_t i = 0; i < velocities.size(); i++)
+                            velocities[i] += next == 1 ? Vec3(0.3, -2, 0.7) : Vec3(0, 0.01 * (double) i, 0);
+                        if (next == 1)
+                            ASSERT(dynamics->changeFrame(velocities));
+                        if (next == 2)
+                            dynamics->changeVelocities(velocities);
+                        if (next == 3)
+                            dynamics->reverse();
+                        if (next == 4) {
+                            settings.stepSize *= 0.7;
+                            dynamics->setSettings(settings);
+                        }
+                        ASSERT(std::isfinite(dynamics->getMonitorValues()[0]));
+                        for (int i = 0; i < 5; i++)
+                            takeStep(*dynamics);
+                    }
+                    ASSERT_EQUAL(untried.getDensity(), tried.getDensity());
+                    ASSERT_EQUAL(untried.getMonitorValues()[0], tried.getMonitorValues()[0]);
+                    for (size_t i = 0; i < e.masses.size(); i++)
+                        ASSERT_EQUAL_VEC(untried.getPositions()[i], tried.getPositions()[i], 0.0);
+                }
+}
+
 void testThreads() {
     // Enough waters, and an odd number of them, for the batches to be shared.
     Example e;
@@ -246,6 +296,7 @@ int main() {
         {"clusters of every shape, Explicit", [] { testShapes(StepDensity::Explicit); }},
         {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
         {"another frame of reference", testChangedFrame},
+        {"steps that fail", testFailedSteps},
         {"any number of threads", testThreads},
         {"the choice of threads", testThreadChoice},
     });
