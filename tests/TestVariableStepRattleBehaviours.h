@@ -6,9 +6,11 @@
 // here it is 1e-4, a hundredth of that, or less, unless a test says why not. Each platform's tests/ includes this file.
 
 #include "TestSupport.h"
+#include "openmm/AndersenThermostat.h"
 #include "openmm/Context.h"
 #include "openmm/CustomExternalForce.h"
 #include "openmm/HarmonicBondForce.h"
+#include "openmm/MonteCarloBarostat.h"
 #include "openmm/NonbondedForce.h"
 #include "openmm/Platform.h"
 #include "openmm/System.h"
@@ -377,6 +379,80 @@ inline void testForceGroups() {
     ASSERT_EQUAL_VEC(Vec3(-1.5e-4, -0.5e-4, 0), context.getState(State::Positions).getPositions()[0], 1e-12);
 }
 
+// An ideal gas, as in OpenMM's tests of thermostats and barostats: no constraint, forces that are zero, a fresh integrator. Steps are
+// nominal, and the thermostat and the barostat find what they need.
+inline void testIdealGas(bool isAtRest) {
+    const int numParticles = 64;
+    const double temperature = 300, pressure = 1.5,
+                 volume = 1.2 * numParticles * BOLTZMANN * temperature / (pressure * 1e5 * 6.02214076e23 * 1e-30);
+    const double box = std::cbrt(volume);
+    System system;
+    system.setDefaultPeriodicBoxVectors(Vec3(box, 0, 0), Vec3(0, box, 0), Vec3(0, 0, box));
+    std::mt19937 random(9);
+    vector<Vec3> positions;
+    NonbondedForce* periodic =
+        new NonbondedForce(); // a barostat wants a Force that is periodic, if it does nothing else
+    periodic->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
+    for (int i = 0; i < numParticles; i++) {
+        system.addParticle(20.0);
+        periodic->addParticle(0.0, 1.0, 0.0);
+        positions.push_back((randomVec(random) + Vec3(0.5, 0.5, 0.5)) * box);
+    }
+    system.addForce(periodic);
+    AndersenThermostat* thermostat = new AndersenThermostat(temperature, 10.0);
+    thermostat->setRandomNumberSeed(3);
+    system.addForce(thermostat);
+    MonteCarloBarostat* barostat = new MonteCarloBarostat(pressure, temperature, 5);
+    barostat->setRandomNumberSeed(4);
+    system.addForce(barostat);
+    VariableStepRattleIntegrator integrator(0.01);
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions(positions);
+    if (!isAtRest)
+        context.setVelocitiesToTemperature(temperature, 6);
+    const int numSteps = isSlowPerStep() ? 400 : 4000;
+    double kinetic = 0, meanVolume = 0;
+    for (int i = 0; i < numSteps; i++) {
+        integrator.step(1);
+        ASSERT_EQUAL(0.01, integrator.getStepSize());
+        const State state = context.getState(State::Energy);
+        kinetic += state.getKineticEnergy() / numSteps;
+        meanVolume += state.getPeriodicBoxVolume() / numSteps;
+    }
+    ASSERT_EQUAL_TOL(0.01 * numSteps, context.getTime(), 1e-10);
+    ASSERT_EQUAL(0.0, integrator.getReferenceMonitorValue());
+    if (isSlowPerStep())
+        return;
+    // <K> = 3/2 N k T, and <V> = (N + 1) k T/p; with these seeds within 5 and 10 %.
+    ASSERT_EQUAL_TOL(1.5 * numParticles * BOLTZMANN * temperature, kinetic, 0.05);
+    ASSERT_EQUAL_TOL(volume / 1.2 * (numParticles + 1) / numParticles, meanVolume, 0.1);
+}
+
+// A Context that computes energies alone needs no step size; no step is taken with it.
+inline void testEnergiesAlone() {
+    System system;
+    for (int i = 0; i < 2; i++)
+        system.addParticle(1.0);
+    HarmonicBondForce* bond = new HarmonicBondForce();
+    bond->addBond(0, 1, 1.5, 2.0);
+    system.addForce(bond);
+    VariableStepRattleIntegrator integrator(0);
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions({Vec3(), Vec3(2.5, 0, 0)});
+    context.setVelocities({Vec3(0, 3, 0), Vec3()});
+    const State state = context.getState(State::Energy | State::Forces);
+    ASSERT_EQUAL_TOL(1.0, state.getPotentialEnergy(), 1e-6);
+    ASSERT_EQUAL_TOL(4.5, state.getKineticEnergy(), 1e-12);
+    ASSERT_EQUAL_VEC(Vec3(2, 0, 0), state.getForces()[0], 1e-6);
+    context.reinitialize(true);
+    for (int i = 0; i < 2; i++)
+        assertThrows("the step size is 0", [&] { integrator.step(1); });
+    ASSERT_EQUAL(0.0, context.getTime());
+    integrator.setStepSize(0.001);
+    integrator.step(10);
+    ASSERT(context.getTime() > 0);
+}
+
 inline TestList getBehaviourTests() {
     TestList tests;
     const char* const names[] = {"SemiExplicit", "Explicit", "Bounded"};
@@ -392,6 +468,9 @@ inline TestList getBehaviourTests() {
     }
     tests.push_back({"constrained massless particles", testConstrainedMasslessParticles});
     tests.push_back({"initial temperature", testInitialTemperature});
+    tests.push_back({"ideal gas", [] { testIdealGas(false); }});
+    tests.push_back({"ideal gas at rest", [] { testIdealGas(true); }});
+    tests.push_back({"energies alone", testEnergiesAlone});
     tests.push_back({"force groups", testForceGroups});
     return tests;
 }

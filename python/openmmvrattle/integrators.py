@@ -42,28 +42,40 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
 
     and the size of the step is stepSize/rho. stepSize is thus the step that is taken where U has its reference value
     U_ref (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The
-    default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
+    default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4), and in a
+    System without constraints ConstraintAndAppliedForce.
 
     For most uses let the integrator choose its steps without a monitor of yours: automatic=True in the constructor, or
     useAutomaticStepControl().
 
-    Each step costs exactly one evaluation of the forces, and a run costs one more at its start. The constraints are
-    solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to the
-    tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
-    getMultipliers().
+    Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run,
+    and after each change of the state by the user or by a Force that moves particles (a barostat); one more where the
+    first step is taken with a given reference value, since that step is then taken twice; one after loading a
+    checkpoint or a State, to compare the forces with the saved ones; and the trial steps of calibrate() and of
+    automatic step control. A monitor ForceGroupEnergy costs the energy of its group on top of each.
+    getNumForceEvaluations() counts all.
+
+    The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly
+    coupled are met to the tolerance or the step fails with an exception; and the multipliers, that is the constraint
+    forces, can be read with getMultipliers().
 
     The velocities in the Context belong to the same time as the positions, and satisfy the velocity constraints:
-    kinetic plus potential energy of a State is the energy at that time.
+    kinetic plus potential energy of a State is the energy at that time. Forces that depend on the time or the step
+    count see those of the end of the step when they are computed there.
 
-    A step that cannot be completed raises an OpenMMException and leaves the Context in the state before that step.
+    A step that cannot be completed raises an OpenMMException and leaves the Context in the state before that step: a
+    run that goes on from there, with other settings perhaps, is the one that it would be if that step had never been
+    tried.
 
     OpenMM's XmlSerializer stores all settings; copies and pickles have the settings too, and no Context. Checkpoints,
     and States made with integratorParameters=True, store the settings and everything else that the next step depends
     on, and loading one brings all of it back, the settings as well: a run that goes on from a checkpoint is the same to
     the last bit on the Reference platform, and from a State to rounding. At the first step after that the forces are
     computed once more. If they are not those of the saved run, because a Force has been changed in the meantime, or if
-    a State's positions or velocities are not the Context's (they were wrapped into the periodic box, say), the run
-    starts afresh with the saved reference values.
+    a State's positions, velocities, box vectors or parameters are not the Context's (positions were wrapped into the
+    periodic box, say), the run starts afresh with the saved reference values. States and checkpoints that were written
+    under another integrator load as well: positions, velocities, time and parameters are taken, the settings stay as
+    they are, and the run starts afresh.
 
     OpenMM's own functions that return an integrator, openmm.XmlSerializer.deserialize() and
     CompoundIntegrator.getIntegrator(), return one of ours as a bare openmm.Integrator; cast() makes it a
@@ -135,7 +147,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         Parameters
         ----------
         stepSize : float or Quantity
-            the nominal step size, taken where the monitor has its reference value (in ps)
+            the nominal step size, taken where the monitor has its reference value (in ps). With 0 no step can be
+            taken, which will do for a Context that computes energies
         updateMethod : int
             the recursion of the step density: SemiExplicit (the default), Explicit or Bounded
         minimumStepSize : float or Quantity
@@ -211,22 +224,24 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     def setNominalStepSize(self, size: float | unit.Quantity) -> None:
         """Set the nominal step size: the step taken where the monitor has its reference value.
 
-        In the course of a run the density is kept, so the steps change in proportion.
+        Where step bounds have been set it must lie between them when the next step is taken; the three can be set in
+        any order. In the course of a run the density is kept, so the steps change in proportion.
 
         Parameters
         ----------
         size : float or Quantity
-            the nominal step size (in ps): positive, and between the step bounds where these have been set
+            the nominal step size (in ps); 0 where no step is to be taken
 
         Raises
         ------
         OpenMMException
-            if size is not a positive finite number between the step bounds
+            if size is negative or not finite
         """
         super().setNominalStepSize(number(size, "size", _TIME))
 
     def getStepSize(self) -> unit.Quantity:
-        """Get the size of the most recent step, or the nominal step size before the first step.
+        """Get the size of the most recent step; before the first step, and when the nominal step size has been set
+        since, the nominal one.
 
         Returns
         -------
@@ -270,12 +285,13 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         Parameters
         ----------
         size : float or Quantity
-            the bound (in ps), smaller than the nominal step size; 0 means no bound
+            the bound (in ps); 0 means no bound. It must be smaller than the nominal step size when the next step is
+            taken
 
         Raises
         ------
         OpenMMException
-            if size is negative, not finite, or not smaller than the nominal step size
+            if size is negative or not finite
         """
         super().setMinimumStepSize(number(size, "size", _TIME))
 
@@ -298,12 +314,13 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         Parameters
         ----------
         size : float or Quantity
-            the bound (in ps), larger than the nominal step size; 0 means no bound
+            the bound (in ps); 0 means no bound. It must be larger than the nominal step size when the next step is
+            taken
 
         Raises
         ------
         OpenMMException
-            if size is not finite, or neither 0 nor larger than the nominal step size
+            if size is negative or not finite
         """
         super().setMaximumStepSize(number(size, "size", _TIME))
 
@@ -428,7 +445,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """Set the force group whose potential energy is the monitor ForceGroupEnergy: a positive function of the
         positions that is written as an OpenMM Force.
 
-        While such a monitor exists, the group is left out of the dynamics.
+        While such a monitor exists, the group is left out of the dynamics, and getIntegrationForceGroups() does not
+        contain it: it is no part of the energy.
 
         Parameters
         ----------
@@ -552,6 +570,10 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """Set the reference value U_ref of a monitor. 0 (the default) means that it is taken at the first step: the
         first step then has the nominal size, and U_ref is the value of U that makes the sequence of densities start
         without oscillation, which is U at the start up to the change of U over a half step.
+
+        While the monitor is zero but for rounding, as that of the constraint forces where nothing pulls and nothing
+        turns, it asks for nothing: steps have the nominal size, and the reference value is taken at the first step
+        after that. Where that is no good measure for the rest of the run, set one, or call calibrate() later.
 
         Parameters
         ----------
@@ -747,7 +769,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """Get how often the forces have been computed for this integrator since the Context was created or
         reinitialized.
 
-        Loading a checkpoint or a State does not change this count, nor the others.
+        This count and the following ones are of the work done in this Context: they are not saved, and loading a
+        checkpoint or a State leaves them as they are.
 
         Returns
         -------
@@ -757,7 +780,7 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         return super().getNumForceEvaluations()
 
     def getNumSolverIterations(self) -> int:
-        """Get how many iterations the solver of the constraints has taken since the Context was created.
+        """Get how many iterations the solver of the constraints has taken since then, those of trial steps among them.
 
         Returns
         -------
