@@ -482,11 +482,12 @@ vector<string> VariableStepRattleIntegrator::getKernelNames() {
 }
 
 void VariableStepRattleIntegrator::stateChanged(State::DataType) {
-    run->stateChanged();
+    if (run != nullptr) // not where Context::reinitialize() has failed
+        run->stateChanged();
 }
 
 double VariableStepRattleIntegrator::computeKineticEnergy() {
-    return run->getDevice().computeKineticEnergy();
+    return requireRun().getDevice().computeKineticEnergy();
 }
 
 bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
@@ -521,7 +522,7 @@ void VariableStepRattleIntegrator::createCheckpoint(std::ostream& stream) const 
     const long long length = (long long) text.str().size();
     data.write(reinterpret_cast<const char*>(&length), sizeof(length));
     data.write(text.str().data(), length);
-    const RunState state = run->save();
+    const RunState state = requireRun().save();
     state.write(data);
     CheckpointBlock::write(stream, data.str());
     lastSaved = state.context;
@@ -552,7 +553,7 @@ void VariableStepRattleIntegrator::serializeParameters(SerializationNode& node) 
     node.setIntProperty("version", PARAMETERS_VERSION);
     node.setStringProperty("integrator", TYPE_NAME);
     node.createChildNode("Settings", this);
-    run->save().write(node.createChildNode("Run"));
+    requireRun().save().write(node.createChildNode("Run"));
 }
 
 void VariableStepRattleIntegrator::deserializeParameters(const SerializationNode& node) {

@@ -548,7 +548,7 @@ def test_removing_the_motion_of_the_centre_changes_nothing() -> None:
 
 def test_a_barostat_runs() -> None:
     """A change of positions costs the forces there, and the densities go on."""
-    from citizen import smooth_cutoff, solvated
+    from run_support import smooth_cutoff, solvated
 
     modeller, force_field = solvated(count=60)
     system = smooth_cutoff(
