@@ -18,7 +18,7 @@ from pathlib import Path
 
 CONSTRAINT_AND_APPLIED_FORCE, MULTIPLIER_P_NORM = 3, 4
 SEMI_EXPLICIT, EXPLICIT = 0, 1
-# Precision, monitor, update, graphs, architectures. The program for SemiExplicit has every kernel, the largest ones too.
+# Precision, monitor, update, graphs, architectures. The program for SemiExplicit has every kernel, and the largest.
 CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),

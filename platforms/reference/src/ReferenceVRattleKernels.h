@@ -4,8 +4,10 @@
 #ifndef OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 #define OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 
-#include "ReferenceRunDevice.h"
+#include "HostRunDevice.h"
+#include "ReferenceVectors.h"
 #include "openmmvrattle/VRattleKernels.h"
+#include <functional>
 #include <memory>
 
 namespace OpenMMVRattle {
@@ -19,13 +21,26 @@ public:
     }
     RunDevice& initialize(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
                           const IntegratorSettings& settings) override {
-        device = std::make_unique<ReferenceRunDevice>(context, data, integrator, settings);
+        device =
+            std::make_unique<HostRunDevice>(context, std::make_unique<ReferenceVectors>(data), integrator, settings);
+        if (getPlatform().getName() != "Reference") { // which does everything on one thread
+            // This thread is awake and takes the share of the pool's first.
+            auto runOnThreads = [this](const std::function<void(int)>& task) {
+                data.threads.execute([&task](OpenMM::ThreadPool&, int thread) {
+                    if (thread > 0)
+                        task(thread);
+                });
+                task(0);
+                data.threads.waitForThreads();
+            };
+            device->setParallel(runOnThreads, data.threads.getNumThreads());
+        }
         return *device;
     }
 
 private:
     OpenMM::ReferencePlatform::PlatformData& data;
-    std::unique_ptr<ReferenceRunDevice> device;
+    std::unique_ptr<HostRunDevice> device;
 };
 
 } // namespace OpenMMVRattle

@@ -1,28 +1,8 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "ReferenceRunDevice.h"
-#include "openmm/AndersenThermostat.h"
-#include "openmm/CMAPTorsionForce.h"
-#include "openmm/CMMotionRemover.h"
-#include "openmm/CustomAngleForce.h"
-#include "openmm/CustomBondForce.h"
-#include "openmm/CustomCentroidBondForce.h"
-#include "openmm/CustomCompoundBondForce.h"
-#include "openmm/CustomExternalForce.h"
-#include "openmm/CustomGBForce.h"
-#include "openmm/CustomHbondForce.h"
-#include "openmm/CustomManyParticleForce.h"
-#include "openmm/CustomNonbondedForce.h"
-#include "openmm/CustomTorsionForce.h"
-#include "openmm/GBSAOBCForce.h"
-#include "openmm/GayBerneForce.h"
-#include "openmm/HarmonicAngleForce.h"
-#include "openmm/HarmonicBondForce.h"
-#include "openmm/NonbondedForce.h"
+#include "HostRunDevice.h"
 #include "openmm/OpenMMException.h"
-#include "openmm/PeriodicTorsionForce.h"
-#include "openmm/RBTorsionForce.h"
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
 #include "run/RunState.h"
@@ -30,8 +10,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <set>
-#include <typeindex>
 
 using namespace OpenMMVRattle;
 using OpenMM::ContextImpl;
@@ -64,27 +42,6 @@ bool hasPeriodicBox(const System& system, const Vec3* boxVectors) {
     return false;
 }
 
-// What a Force may change before a step (ForceImpl::updateContextState). Of OpenMM's own Forces that are mere functions of the
-// positions we know that they change nothing, of some others that they leave the positions alone; of all others we know nothing.
-enum Reach { NoReach, VelocityReach, FullReach };
-Reach reachOf(const OpenMM::Force& force) {
-    static const std::set<std::type_index> harmless = {
-        typeid(OpenMM::CMAPTorsionForce),        typeid(OpenMM::CustomAngleForce),
-        typeid(OpenMM::CustomBondForce),         typeid(OpenMM::CustomCentroidBondForce),
-        typeid(OpenMM::CustomCompoundBondForce), typeid(OpenMM::CustomExternalForce),
-        typeid(OpenMM::CustomGBForce),           typeid(OpenMM::CustomHbondForce),
-        typeid(OpenMM::CustomManyParticleForce), typeid(OpenMM::CustomNonbondedForce),
-        typeid(OpenMM::CustomTorsionForce),      typeid(OpenMM::GBSAOBCForce),
-        typeid(OpenMM::GayBerneForce),           typeid(OpenMM::HarmonicAngleForce),
-        typeid(OpenMM::HarmonicBondForce),       typeid(OpenMM::NonbondedForce),
-        typeid(OpenMM::PeriodicTorsionForce),    typeid(OpenMM::RBTorsionForce)};
-    static const std::set<std::type_index> thermal = {typeid(OpenMM::AndersenThermostat),
-                                                      typeid(OpenMM::CMMotionRemover)};
-    if (harmless.count(typeid(force)) > 0)
-        return NoReach;
-    return thermal.count(typeid(force)) > 0 ? VelocityReach : FullReach;
-}
-
 // Whether two sets of forces are the same but for rounding; a particle in equilibrium is measured by the others.
 bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
     double meanSquare = 0;
@@ -100,12 +57,11 @@ bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
 
 } // namespace
 
-ReferenceRunDevice::ReferenceRunDevice(ContextImpl& context, OpenMM::ReferencePlatform::PlatformData& data,
-                                       const OpenMM::Integrator& integrator,
-                                       const IntegratorSettings& integratorSettings) :
-        context(context), data(data), integrator(integrator), expressions(integratorSettings.expressions), settings(),
-        forceGroups(0), monitorForceGroup(NO_MONITOR_GROUP), mayForcesChangePositions(false),
-        mayForcesChangeVelocities(false), lastStep{0.0, 1.0}, numForceEvaluations(0) {
+HostRunDevice::HostRunDevice(ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
+                             const OpenMM::Integrator& integrator, const IntegratorSettings& integratorSettings) :
+        context(context), vectors(std::move(vectors)), integrator(integrator),
+        expressions(integratorSettings.expressions), settings(), forceGroups(0), monitorForceGroup(NO_MONITOR_GROUP),
+        lastStep{0.0, 1.0}, numForceEvaluations(0) {
     const System& system = context.getSystem();
     masses.resize(system.getNumParticles());
     for (int i = 0; i < system.getNumParticles(); i++)
@@ -122,29 +78,14 @@ ReferenceRunDevice::ReferenceRunDevice(ContextImpl& context, OpenMM::ReferencePl
             throw OpenMMException("VariableStepRattleIntegrator: constraint " + std::to_string(i) +
                                   " of the System has a length that is not a positive finite number");
     }
-    for (int i = 0; i < system.getNumForces(); i++) {
-        const Reach reach = reachOf(system.getForce(i));
-        mayForcesChangePositions = mayForcesChangePositions || reach == FullReach;
-        mayForcesChangeVelocities = mayForcesChangeVelocities || reach != NoReach;
-    }
+    for (int i = 0; i < system.getNumForces(); i++)
+        reach.add(system.getForce(i));
     dynamics = std::make_unique<VRattleDynamics>(masses, constraints, expressions);
-    if (context.getPlatform().getName() != "Reference") { // which does everything on one thread
-        // This thread is awake and takes the share of the pool's first.
-        auto runOnThreads = [this](const std::function<void(int)>& task) {
-            this->data.threads.execute([&task](OpenMM::ThreadPool&, int thread) {
-                if (thread > 0)
-                    task(thread);
-            });
-            task(0);
-            this->data.threads.waitForThreads();
-        };
-        dynamics->setParallel(runOnThreads, data.threads.getNumThreads());
-    }
 }
 
 // -------------------------------------------------------------------------------------------------------- the settings
 
-void ReferenceRunDevice::setSettings(const IntegratorSettings& from) {
+void HostRunDevice::setSettings(const IntegratorSettings& from) {
     VRattleDynamics::Settings to;
     to.stepSize = from.stepSize;
     to.minimumStep = from.stepSize > 0 ? from.getMinimumStep() : 0.0;
@@ -168,44 +109,47 @@ void ReferenceRunDevice::setSettings(const IntegratorSettings& from) {
         }
 }
 
-vector<double> ReferenceRunDevice::getReferences() {
+vector<double> HostRunDevice::getReferences() {
     return dynamics->getReferences();
 }
 
-void ReferenceRunDevice::setReferences(const vector<double>& references) {
+void HostRunDevice::setReferences(const vector<double>& references) {
     dynamics->setReferences(references);
 }
 
 // ------------------------------------------------------------------------------------------ what happens to the Context
 
-bool ReferenceRunDevice::updateState() {
+bool HostRunDevice::updateState() {
     return context.updateContextState();
 }
 
-RunDevice::Change ReferenceRunDevice::findChange() {
-    const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, data.periodicBoxVectors);
-    std::copy(data.periodicBoxVectors, data.periodicBoxVectors + 3, boxVectors);
+RunDevice::Change HostRunDevice::findChange() {
+    const Vec3* box = vectors->getBoxVectors();
+    const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
+    std::copy(box, box + 3, boxVectors);
     if (isOtherBox || dynamics->getPositions().empty())
         return Change::Box;
     // A look at all positions and velocities is spent only where it may find something: where a Force may have changed them, or
     // another integrator (of a CompoundIntegrator) may have taken steps.
     const bool mustCompare = ahead != nullptr || &context.getIntegrator() != &integrator;
-    if ((mustCompare || mayForcesChangePositions) && differ(*data.positions, knownPositions()))
+    if ((mustCompare || reach.isUnknown || reach.hasBarostat) && differ(vectors->getPositions(), knownPositions()))
         return Change::State;
-    if ((mustCompare || mayForcesChangeVelocities) && differ(*data.velocities, knownVelocities()))
+    if ((mustCompare || reach.isUnknown || reach.hasBarostat || reach.hasThermostat || reach.movesFrame) &&
+        differ(vectors->getVelocities(), knownVelocities()))
         return Change::Velocities;
     return Change::None;
 }
 
-unsigned long long ReferenceRunDevice::getFingerprint() {
+unsigned long long HostRunDevice::getFingerprint() {
+    const Vectors &positions = vectors->getPositions(), &velocities = vectors->getVelocities();
     Fingerprint fingerprint;
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0) {
-            fingerprint.add((*data.positions)[i]);
-            fingerprint.add((*data.velocities)[i]);
+            fingerprint.add(positions[i]);
+            fingerprint.add(velocities[i]);
         }
     for (int i = 0; i < 3; i++)
-        fingerprint.add(data.periodicBoxVectors[i]);
+        fingerprint.add(vectors->getBoxVectors()[i]);
     for (const auto& parameter : context.getParameters()) {
         fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
         fingerprint.add(parameter.second);
@@ -213,59 +157,60 @@ unsigned long long ReferenceRunDevice::getFingerprint() {
     return fingerprint.get();
 }
 
-void ReferenceRunDevice::start() {
-    const bool hasBox = hasPeriodicBox(context.getSystem(), data.periodicBoxVectors);
+void HostRunDevice::start() {
+    const Vec3* box = vectors->getBoxVectors();
+    const bool hasBox = hasPeriodicBox(context.getSystem(), box);
     requireSoundStart(dynamics->getConstraintSystem(),
-                      {*data.positions, *data.velocities, isVirtualSite, hasBox ? data.periodicBoxVectors : nullptr});
-    const Vectors before = *data.positions;
+                      {vectors->getPositions(), vectors->getVelocities(), isVirtualSite, hasBox ? box : nullptr});
+    const Vectors before = vectors->getPositions();
     try {
         context.computeVirtualSites(); // setPositions() leaves them where the user puts them
         context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
-        Vectors positions = *data.positions, forces;
+        Vectors positions = vectors->getPositions(), forces;
         dynamics->projectPositions(positions);
         const double energy = computeForcesAt(positions, forces);
-        dynamics->begin(positions, *data.velocities, forces, energy);
+        dynamics->begin(positions, vectors->getVelocities(), forces, energy);
     }
     catch (...) {
-        *data.positions = before;
+        vectors->setPositions(before);
         throw;
     }
-    ahead.reset(new Ahead{*data.positions, *data.velocities});
+    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void ReferenceRunDevice::changeState() {
-    Vectors positions = *data.positions, forces;
+void HostRunDevice::changeState() {
+    Vectors positions = vectors->getPositions(), forces;
     dynamics->projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
     const double energy = computeForcesAt(positions, forces);
-    dynamics->changeState(positions, *data.velocities, forces, energy);
-    ahead.reset(new Ahead{*data.positions, *data.velocities});
+    dynamics->changeState(positions, vectors->getVelocities(), forces, energy);
+    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void ReferenceRunDevice::changeVelocities() {
-    if (ahead == nullptr && dynamics->changeFrame(*data.velocities))
+void HostRunDevice::changeVelocities() {
+    if (ahead == nullptr && dynamics->changeFrame(vectors->getVelocities()))
         return;
-    dynamics->changeVelocities(*data.velocities);
-    ahead.reset(new Ahead{*data.positions, *data.velocities});
+    dynamics->changeVelocities(vectors->getVelocities());
+    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void ReferenceRunDevice::writeVelocities() {
-    writeMoving(dynamics->getVelocities(), *data.velocities);
+void HostRunDevice::writeVelocities() {
+    writeMovingVelocities(dynamics->getVelocities());
     if (ahead != nullptr)
-        ahead->velocities = *data.velocities;
+        ahead->velocities = vectors->getVelocities();
 }
 
 // The forces at positions that may not be those of the Context, which keeps its own; returns the energy of the monitor's group.
-double ReferenceRunDevice::computeForcesAt(const Vectors& positions, Vectors& forces) {
-    const bool isElsewhere = differ(*data.positions, positions);
-    const Vectors before = isElsewhere ? *data.positions : Vectors();
+double HostRunDevice::computeForcesAt(const Vectors& positions, Vectors& forces) {
+    const bool isElsewhere = differ(vectors->getPositions(), positions);
+    const Vectors before = isElsewhere ? vectors->getPositions() : Vectors();
     auto putBack = [&] {
         if (isElsewhere)
-            *data.positions = before;
+            vectors->setPositions(before);
     };
     double energy;
     try {
         if (isElsewhere) {
-            writeMoving(positions, *data.positions);
+            writeMovingPositions(positions);
             context.computeVirtualSites();
         }
         energy = computeForces();
@@ -274,39 +219,57 @@ double ReferenceRunDevice::computeForcesAt(const Vectors& positions, Vectors& fo
         putBack();
         throw;
     }
-    forces = *data.forces;
+    forces = vectors->getForces();
     putBack();
     return energy;
 }
 
-double ReferenceRunDevice::computeForces() {
+double HostRunDevice::computeForces() {
+    // The energy first: some platforms use up the forces for it.
+    const double energy =
+        monitorForceGroup == NO_MONITOR_GROUP ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
     context.calcForcesAndEnergy(true, false, forceGroups);
     numForceEvaluations++;
-    return monitorForceGroup == NO_MONITOR_GROUP ? 0.0
-                                                 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
+    return energy;
 }
 
-const vector<Vec3>& ReferenceRunDevice::knownPositions() const {
+const vector<Vec3>& HostRunDevice::knownPositions() const {
     return ahead != nullptr ? ahead->positions : dynamics->getPositions();
 }
 
-const vector<Vec3>& ReferenceRunDevice::knownVelocities() const {
+const vector<Vec3>& HostRunDevice::knownVelocities() const {
     return ahead != nullptr ? ahead->velocities : dynamics->getVelocities();
 }
 
 // Particles of mass zero are not the integrator's to move: they are virtual sites, or fixed.
-bool ReferenceRunDevice::differ(const Vectors& a, const Vectors& b) const {
+bool HostRunDevice::differ(const Vectors& a, const Vectors& b) const {
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0 && a[i] != b[i])
             return true;
     return false;
 }
 
-void ReferenceRunDevice::writeMoving(const Vectors& from, Vectors& to) const {
+void HostRunDevice::writeMovingPositions(const Vectors& positions) {
     if (!hasMassless) {
-        to = from;
+        vectors->setPositions(positions);
         return;
     }
+    Vectors all = vectors->getPositions();
+    copyMoving(positions, all);
+    vectors->setPositions(all);
+}
+
+void HostRunDevice::writeMovingVelocities(const Vectors& velocities) {
+    if (!hasMassless) {
+        vectors->setVelocities(velocities);
+        return;
+    }
+    Vectors all = vectors->getVelocities();
+    copyMoving(velocities, all);
+    vectors->setVelocities(all);
+}
+
+void HostRunDevice::copyMoving(const Vectors& from, Vectors& to) const {
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0)
             to[i] = from[i];
@@ -314,84 +277,86 @@ void ReferenceRunDevice::writeMoving(const Vectors& from, Vectors& to) const {
 
 // ----------------------------------------------------------------------------------------------------------- the steps
 
-bool ReferenceRunDevice::hasStarted() {
+bool HostRunDevice::hasStarted() {
     return dynamics->hasStarted();
 }
 
 // One step of the method in the Context, the velocities excepted. Forces see the time of its end.
-double ReferenceRunDevice::advance(double maxTime, double direction) {
-    const double time = data.time, maxStep = maxTime - time;
+double HostRunDevice::advance(double maxTime, double direction) {
+    const double time = vectors->getTime(), maxStep = maxTime - time;
     while (true) {
         const double size = dynamics->step(maxStep);
-        data.time = size < maxStep ? time + direction * size : maxTime;
-        writeMoving(dynamics->getNextPositions(), *data.positions);
+        vectors->setTime(size < maxStep ? time + direction * size : maxTime);
+        writeMovingPositions(dynamics->getNextPositions());
         context.computeVirtualSites();
         const double energy = computeForces();
-        if (dynamics->finish(*data.forces, energy))
+        if (dynamics->finish(vectors->getForces(), energy))
             return size;
     }
 }
 
-void ReferenceRunDevice::step(double maxTime) {
-    const double time = data.time;
-    const auto count = data.stepCount;
+void HostRunDevice::step(double maxTime) {
+    const double time = vectors->getTime();
+    const long long count = vectors->getStepCount();
     try {
-        data.stepCount++;
+        vectors->setStepCount(count + 1);
         lastStep.size = advance(maxTime, 1);
     }
     catch (...) {
-        data.time = time;
-        data.stepCount = count;
+        vectors->setTime(time);
+        vectors->setStepCount(count);
         dynamics->abandonStep();
         putBack();
         throw;
     }
     lastStep.density = dynamics->getDensity();
-    writeMoving(dynamics->getVelocities(), *data.velocities);
+    writeMovingVelocities(dynamics->getVelocities());
     ahead.reset();
     beforeDensities.reset();
 }
 
-void ReferenceRunDevice::settle() {
+void HostRunDevice::settle() {
 }
 
 // The positions of the Context before a step.
-void ReferenceRunDevice::putBack() {
+void HostRunDevice::putBack() {
     if (ahead != nullptr) {
-        *data.positions = ahead->positions;
+        vectors->setPositions(ahead->positions);
         return;
     }
-    writeMoving(dynamics->getPositions(), *data.positions);
+    writeMovingPositions(dynamics->getPositions());
     context.computeVirtualSites();
 }
 
-void ReferenceRunDevice::reverse() {
+void HostRunDevice::reverse() {
     dynamics->reverse();
     lastStep.density = dynamics->getDensity();
+    Vectors velocities = vectors->getVelocities();
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0)
-            (*data.velocities)[i] *= -1;
+            velocities[i] *= -1;
+    vectors->setVelocities(velocities);
     if (ahead != nullptr)
-        ahead->velocities = *data.velocities;
+        ahead->velocities = velocities;
 }
 
-RunDevice::LastStep ReferenceRunDevice::getLastStep() {
+RunDevice::LastStep HostRunDevice::getLastStep() {
     return lastStep;
 }
 
-double ReferenceRunDevice::getTime() {
-    return data.time;
+double HostRunDevice::getTime() {
+    return vectors->getTime();
 }
 
-long long ReferenceRunDevice::getStepCount() {
-    return data.stepCount;
+long long HostRunDevice::getStepCount() {
+    return vectors->getStepCount();
 }
 
 // ---------------------------------------------------------------------------------------------------------- trial runs
 
-void ReferenceRunDevice::beginTrial(double stepSize, bool isBackwards) {
+void HostRunDevice::beginTrial(double stepSize, bool isBackwards) {
     const double direction = isBackwards ? -1 : 1;
-    trial.reset(new Trial{dynamics->keep(), data.time, direction});
+    trial.reset(new Trial{dynamics->keep(), vectors->getTime(), direction});
     VRattleDynamics::Settings fixed = settings;
     fixed.isFixedStep = true;
     fixed.stepSize = stepSize;
@@ -408,7 +373,7 @@ void ReferenceRunDevice::beginTrial(double stepSize, bool isBackwards) {
     }
 }
 
-void ReferenceRunDevice::takeTrialStep() {
+void HostRunDevice::takeTrialStep() {
     try {
         advance(std::numeric_limits<double>::infinity(), trial->direction);
     }
@@ -418,64 +383,64 @@ void ReferenceRunDevice::takeTrialStep() {
     }
 }
 
-void ReferenceRunDevice::endTrial() {
+void HostRunDevice::endTrial() {
     if (trial == nullptr)
         return;
     dynamics->putBack(trial->kept);
-    data.time = trial->time;
+    vectors->setTime(trial->time);
     trial.reset();
     putBack();
 }
 
 // ------------------------------------------------------------------------------------------------------------- numbers
 
-vector<double> ReferenceRunDevice::getMonitorValues() {
+vector<double> HostRunDevice::getMonitorValues() {
     if (!settings.isAutomatic)
         return dynamics->getMonitorValues();
     const AutomaticControl::Memory& memory = dynamics->getAutomaticControl().getMemory();
     return {std::begin(memory.values), std::end(memory.values)};
 }
 
-vector<double> ReferenceRunDevice::getMultipliers() {
+vector<double> HostRunDevice::getMultipliers() {
     vector<double> result;
     dynamics->getConstraintSystem().getGivenMultipliers(dynamics->getMultipliers(), result);
     return result;
 }
 
-double ReferenceRunDevice::computeKineticEnergy() {
+double HostRunDevice::computeKineticEnergy() {
     double sum = 0;
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0) // the velocities of the others have no meaning, and may be no numbers
-            sum += masses[i] * (*data.velocities)[i].dot((*data.velocities)[i]);
+            sum += masses[i] * vectors->getVelocities()[i].dot(vectors->getVelocities()[i]);
     return 0.5 * sum;
 }
 
-long long ReferenceRunDevice::getNumForceEvaluations() {
+long long HostRunDevice::getNumForceEvaluations() {
     return numForceEvaluations;
 }
 
-long long ReferenceRunDevice::getNumSolverIterations() {
+long long HostRunDevice::getNumSolverIterations() {
     return dynamics->getNumIterations();
 }
 
-long long ReferenceRunDevice::getNumRescues() {
+long long HostRunDevice::getNumRescues() {
     return dynamics->getNumRescues();
 }
 
-double ReferenceRunDevice::getNegligibleValue() {
+double HostRunDevice::getNegligibleValue() {
     return dynamics->getAutomaticControl().getNegligibleValue(dynamics->getVelocities());
 }
 
-double ReferenceRunDevice::densityOf(const vector<double>& values) {
+double HostRunDevice::densityOf(const vector<double>& values) {
     return dynamics->getAutomaticControl().densityOf({values[0], values[1]});
 }
 
-void ReferenceRunDevice::startDensities(const vector<double>& back, const vector<double>& secondBack) {
+void HostRunDevice::startDensities(const vector<double>& back, const vector<double>& secondBack) {
     beforeDensities = std::make_unique<VRattleDynamics::Kept>(dynamics->keep());
     dynamics->startAutomatic({back[0], back[1]}, {secondBack[0], secondBack[1]});
 }
 
-void ReferenceRunDevice::undoStartDensities() {
+void HostRunDevice::undoStartDensities() {
     if (beforeDensities != nullptr)
         dynamics->putBack(*beforeDensities);
     beforeDensities.reset();
@@ -483,7 +448,7 @@ void ReferenceRunDevice::undoStartDensities() {
 
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
-void ReferenceRunDevice::save(RunState& run) {
+void HostRunDevice::save(RunState& run) {
     const VRattleDynamics::Memory memory = dynamics->getMemory();
     run.halfStepVelocities = memory.halfStepVelocities;
     run.methodValues = {{"hasDensity", {(double) memory.hasDensity}},
@@ -506,18 +471,18 @@ void ReferenceRunDevice::save(RunState& run) {
     run.forces = dynamics->getForces();
     run.groupEnergy = dynamics->getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
-    if (differ(*data.positions, dynamics->getPositions()))
+    if (differ(vectors->getPositions(), dynamics->getPositions()))
         run.positions = dynamics->getPositions();
-    if (differ(*data.velocities, dynamics->getVelocities()))
+    if (differ(vectors->getVelocities(), dynamics->getVelocities()))
         run.velocities = dynamics->getVelocities();
     run.isContextAhead = ahead != nullptr;
-    if (ahead != nullptr && differ(*data.positions, ahead->positions))
+    if (ahead != nullptr && differ(vectors->getPositions(), ahead->positions))
         run.contextPositions = ahead->positions;
-    if (ahead != nullptr && differ(*data.velocities, ahead->velocities))
+    if (ahead != nullptr && differ(vectors->getVelocities(), ahead->velocities))
         run.contextVelocities = ahead->velocities;
 }
 
-VRattleDynamics::Memory ReferenceRunDevice::memoryOf(const RunState& run, const IntegratorSettings& saved) const {
+VRattleDynamics::Memory HostRunDevice::memoryOf(const RunState& run, const IntegratorSettings& saved) const {
     const size_t numConstraints = dynamics->getConstraintSystem().getNumConstraints();
     VRattleDynamics::Memory memory = {};
     memory.hasDensity = run.getMethodValue("hasDensity") != 0;
@@ -544,14 +509,14 @@ VRattleDynamics::Memory ReferenceRunDevice::memoryOf(const RunState& run, const 
     return memory;
 }
 
-bool ReferenceRunDevice::canResume(const RunState& run, const IntegratorSettings& saved) {
+bool HostRunDevice::canResume(const RunState& run, const IntegratorSettings& saved) {
     memoryOf(run, saved);
     return true;
 }
 
-bool ReferenceRunDevice::resume(const RunState& run, const IntegratorSettings& saved) {
-    const Vectors& positions = run.positions.empty() ? *data.positions : run.positions;
-    const Vectors& velocities = run.velocities.empty() ? *data.velocities : run.velocities;
+bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved) {
+    const Vectors& positions = run.positions.empty() ? vectors->getPositions() : run.positions;
+    const Vectors& velocities = run.velocities.empty() ? vectors->getVelocities() : run.velocities;
     Vectors forces;
     const double energy = computeForcesAt(positions, forces);
     const double larger = std::max(std::fabs(energy), std::fabs(run.groupEnergy));
@@ -560,8 +525,8 @@ bool ReferenceRunDevice::resume(const RunState& run, const IntegratorSettings& s
     dynamics->resume(positions, velocities, forces, energy, memoryOf(run, saved));
     ahead.reset();
     if (run.isContextAhead)
-        ahead.reset(new Ahead{run.contextPositions.empty() ? *data.positions : run.contextPositions,
-                              run.contextVelocities.empty() ? *data.velocities : run.contextVelocities});
+        ahead.reset(new Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,
+                              run.contextVelocities.empty() ? vectors->getVelocities() : run.contextVelocities});
     std::copy(run.boxVectors, run.boxVectors + 3, boxVectors);
     return true;
 }

@@ -1,12 +1,13 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#ifndef OPENMMVRATTLE_REFERENCERUNDEVICE_H_
-#define OPENMMVRATTLE_REFERENCERUNDEVICE_H_
+#ifndef OPENMMVRATTLE_HOSTRUNDEVICE_H_
+#define OPENMMVRATTLE_HOSTRUNDEVICE_H_
 
+#include "ContextVectors.h"
+#include "ForceReach.h"
 #include "openmm/Integrator.h"
 #include "openmm/internal/ContextImpl.h"
-#include "openmm/reference/ReferencePlatform.h"
 #include "run/RunDevice.h"
 #include "step/VRattleDynamics.h"
 #include <memory>
@@ -15,13 +16,17 @@
 namespace OpenMMVRattle {
 
 /**
- * The device for the Reference platform and those derived from it: it moves data between the vectors of a Context and
- * VRattleDynamics, and asks for the forces.
+ * A device that computes on the host: it moves data between the vectors of a Context and VRattleDynamics, and asks for the forces.
+ * All there is to Reference and the platforms derived from it; on a GPU it does what is rare, such as starts.
  */
-class ReferenceRunDevice : public RunDevice {
+class HostRunDevice : public RunDevice {
 public:
-    ReferenceRunDevice(OpenMM::ContextImpl& context, OpenMM::ReferencePlatform::PlatformData& data,
-                       const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    HostRunDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
+                  const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    /** Let threads share the work; see VRattleDynamics::setParallel(). */
+    void setParallel(const VRattleDynamics::Parallel& parallel, int numThreads) {
+        dynamics->setParallel(parallel, numThreads);
+    }
     void setSettings(const IntegratorSettings& settings) override;
     std::vector<double> getReferences() override;
     void setReferences(const std::vector<double>& references) override;
@@ -56,23 +61,26 @@ public:
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
     bool resume(const RunState& run, const IntegratorSettings& saved) override;
 
-private:
+protected:
     typedef std::vector<OpenMM::Vec3> Vectors;
     /** The Context, where it is not in the method's state: as the user or a Force has left it, until a step is complete. */
     struct Ahead {
         Vectors positions, velocities;
     };
     VRattleDynamics::Memory memoryOf(const RunState& run, const IntegratorSettings& saved) const;
-    double computeForces();
+    /** Compute the forces at the Context's positions; returns the energy of the monitor's group there. */
+    virtual double computeForces();
     double computeForcesAt(const Vectors& positions, Vectors& forces);
     double advance(double maxTime, double direction);
     void putBack();
     const Vectors& knownPositions() const;
     const Vectors& knownVelocities() const;
     bool differ(const Vectors& a, const Vectors& b) const;
-    void writeMoving(const Vectors& from, Vectors& to) const;
+    void writeMovingPositions(const Vectors& positions);
+    void writeMovingVelocities(const Vectors& velocities);
+    void copyMoving(const Vectors& from, Vectors& to) const;
     OpenMM::ContextImpl& context;
-    OpenMM::ReferencePlatform::PlatformData& data;
+    std::unique_ptr<ContextVectors> vectors;
     const OpenMM::Integrator& integrator;
     std::vector<double> masses;
     std::vector<char> isVirtualSite;
@@ -80,7 +88,8 @@ private:
     std::unique_ptr<VRattleDynamics> dynamics;
     VRattleDynamics::Settings settings;
     int forceGroups, monitorForceGroup;
-    bool hasMassless, mayForcesChangePositions, mayForcesChangeVelocities;
+    bool hasMassless;
+    ForceReach reach;
     std::unique_ptr<Ahead> ahead;
     OpenMM::Vec3 boxVectors[3]; // when they were last looked at
     LastStep lastStep;
@@ -96,4 +105,4 @@ private:
 
 } // namespace OpenMMVRattle
 
-#endif // OPENMMVRATTLE_REFERENCERUNDEVICE_H_
+#endif // OPENMMVRATTLE_HOSTRUNDEVICE_H_
