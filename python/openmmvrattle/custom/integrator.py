@@ -18,6 +18,7 @@ import openmm
 from openmm import unit
 
 from .._arguments import integer, monitor_arguments, number
+from .checks import require_sound_start
 from .program import KEPT, make_program
 from .run import Run, find_context, positions_of, redundant_constraints, vectors, velocities_of
 from .settings import (
@@ -753,6 +754,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
     def _apply_constraints(self, context: openmm.Context) -> None:
         """Put the state onto the constraints, as at the start of every run."""
+        require_sound_start(context)
         context.applyConstraints(self.getConstraintTolerance())
         context.applyVelocityConstraints(self.getConstraintTolerance())
 

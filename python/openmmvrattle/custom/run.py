@@ -11,6 +11,7 @@ import numpy as np
 import openmm
 
 from .._constraint_errors import DistanceConstraints
+from .checks import require_masses
 from .settings import INSTEAD, Settings, error
 
 LOST = 1e-3
@@ -45,6 +46,7 @@ class Run:
         return self._context()
 
     def _refuse(self, system: openmm.System, settings: Settings) -> None:
+        require_masses(system)
         named = any(monitor.name == "ConstraintForce" and not monitor.is_default for monitor in settings.monitors)
         if named and not system.getNumConstraints():
             raise error(
