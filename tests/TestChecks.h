@@ -62,6 +62,17 @@ inline void testMasses() {
     }
 }
 
+inline void testLengths() {
+    for (double length : {0.0, -0.1, NOT_A_NUMBER}) {
+        TestSystem t;
+        makeBox(t, {Vec3(), Vec3(0.1, 0, 0)}, 5);
+        t.system.addConstraint(0, 1, length);
+        std::stringstream text;
+        text << "constraint 0 of the System, of the particles 0 and 1, has a length of " << length << " nm";
+        assertThrows(text.str(), [&] { tryToCreate(t.system); });
+    }
+}
+
 inline void testConstrainedSites() {
     TestSystem t;
     makeBox(t, {Vec3(), Vec3(0.1, 0, 0), Vec3(), Vec3(), Vec3(1, 1, 1), Vec3(1, 1, 1.1)}, 5);
@@ -303,6 +314,40 @@ inline void testPositions() {
     makeBox(t, {Vec3(1, 1, 1), Vec3(1, 1, 1)}, 5);
     t.system.addConstraint(0, 1, 0.1);
     assertThrows("the particles 0 and 1 are at the same position", [&] { tryToStep(t); });
+}
+
+// Positions whose rounding is larger than the tolerance of a constraint, which a larger tolerance allows.
+inline void testPositionsFarOut() {
+    for (bool isExpression : {false, true}) {
+        TestSystem t;
+        makeBox(t, {Vec3(1e8, 1e8, 1e8), Vec3(1e8 + 0.1, 1e8, 1e8)}, 5);
+        Integrator_ integrator = makeFixedStepIntegrator();
+        if (isExpression)
+            integrator.addConstraint(DISTANCE, {0, 1}, {{"d", 0.1}});
+        else
+            t.system.addConstraint(0, 1, 0.1);
+        assertThrows("by positions as large as 1e+08 nm, which are rounded to 2.22045e-08 nm",
+                     [&] { tryToStep(t, integrator); });
+        integrator.setConstraintTolerance(1e-5);
+        tryToStep(t, integrator);
+    }
+}
+
+inline void testSmallestStep() {
+    TestSystem t;
+    makeChain(t, 4);
+    Integrator_ integrator(1e-100);
+    tryToStep(t, integrator);
+    assertThrows("a step size of 1e-300 ps is too small to compute with", [&] { integrator.setStepSize(1e-300); });
+}
+
+inline void testConstraintsThatContradictEachOther() {
+    TestSystem t;
+    makeBox(t, {Vec3(), Vec3(0.1, 0, 0), Vec3(0.1, 0.1, 0)}, 5);
+    t.system.addConstraint(0, 1, 0.1);
+    t.system.addConstraint(1, 2, 0.1);
+    t.system.addConstraint(0, 2, 0.3);
+    assertThrows("constraints that contradict each other have none", [&] { tryToStep(t); });
 }
 
 inline void testFastVelocities() {

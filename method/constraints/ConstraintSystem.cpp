@@ -6,6 +6,7 @@
 #include <cmath>
 #include <map>
 #include <set>
+#include <sstream>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -65,6 +66,23 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
                   "gradient does not vanish where it holds"
                 : " is not finite at these positions; choose others, or write it such that it has a derivative "
                   "where it holds");
+}
+
+std::string ConstraintSystem::explainResolution(int index, const vector<Vec3>& q, double tolerance) const {
+    const DistanceConstraint& c = constraints[index];
+    double largest = 0;
+    for (int i : isExpression(index) ? getExpression(index).particles : vector<int>{c.particle1, c.particle2})
+        for (int axis = 0; axis < 3; axis++)
+            largest = std::max(largest, std::fabs(q[i][axis]));
+    const double spacing = std::numeric_limits<double>::epsilon() * largest;
+    const double length = isExpression(index) ? EXPRESSION_LENGTH : c.length;
+    if (!(spacing > tolerance * length))
+        return "";
+    std::stringstream text;
+    text << describe(index) << " cannot be met to a fraction of " << tolerance << " of " << length
+         << " nm by positions as large as " << largest << " nm, which are rounded to " << spacing
+         << " nm; bring the particles nearer to the origin, or raise the constraint tolerance";
+    return text.str();
 }
 
 std::string ConstraintSystem::explainLine(int cluster) const {

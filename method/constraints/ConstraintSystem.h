@@ -274,6 +274,8 @@ public:
     void getGivenMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
     /** Say in words what is wrong with a constraint whose gradient is zero or not finite; empty if neither is so. */
     std::string explainGradient(int index, const Jacobian& jacobian) const;
+    /** Say in words, and with the way out, that positions are too large for the tolerance of a constraint; else empty. */
+    std::string explainResolution(int index, const std::vector<OpenMM::Vec3>& q, double tolerance) const;
     /** Say in words, and with the way out, that all distances of three particles in a line are among a cluster's; else empty. */
     std::string explainLine(int cluster) const;
 

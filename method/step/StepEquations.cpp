@@ -271,7 +271,10 @@ bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
         for (int i : movingParticles)
             acceleration[i] = qNext[i] - positions[i];
         system.evaluateJacobian(positions, jacobian);
-        throwNotConverged(positions, acceleration);
+        throw StepFailure(explainNotConverged(
+            positions, acceleration,
+            "; set positions that are nearer to where the constraints hold, if there are such: constraints that "
+            "contradict each other have none"));
     }
     positions = qNext;
     return true;
@@ -724,29 +727,37 @@ double VRattleDynamics::solveRegular() {
 void VRattleDynamics::throwNotConverged(const Trial& trial) {
     for (int i : movingParticles)
         acceleration[i] = trial.start[i] * trial.drift;
-    throwNotConverged(q, acceleration);
-}
-
-void VRattleDynamics::throwNotConverged(const vector<Vec3>& from, const vector<Vec3>& displacement) {
     std::stringstream reason;
-    // What keeps an iteration from converging need not be what has the largest error in the end.
-    const int worst = system.findLargest(residual, jacobian);
-    const int singular = system.findSingular(from, displacement, jacobian, velocityJacobian);
-    if (singular != ConstraintSystem::NONE)
-        reason << system.describe(singular)
-               << " is close to a singular geometry, in which its gradient is infinite or zero (as that of a dihedral "
-                  "angle "
-                  "over three particles in a line); keep the molecule away from there, or constrain something else";
-    else if (std::isfinite(lastError))
-        reason << system.describe(worst) << " could not be solved for (relative error " << lastError << " left)";
-    else if (system.isExpression(worst) && !std::isfinite(residual[worst]))
-        reason << system.describe(worst) << " became " << residual[worst];
-    else
-        reason << "the constraints could not be solved for (the iteration diverged)";
+    reason << explainNotConverged(q, acceleration, "");
     if (hasDensity && settings.isAutomatic)
         reason << "; the step tried was of " << settings.stepSize / rhoNext << " ps";
     else if (hasDensity && !monitor.isEmpty())
         reason << "; u = U/U_ref was " << u << " before the step and the last one tried was of "
                << settings.stepSize / rhoNext << " ps";
     throw StepFailure(reason.str());
+}
+
+// The way out is for what has no explanation of its own.
+std::string VRattleDynamics::explainNotConverged(const vector<Vec3>& from, const vector<Vec3>& displacement,
+                                                 const std::string& wayOut) {
+    std::stringstream reason;
+    // What keeps an iteration from converging need not be what has the largest error in the end.
+    const int worst = system.findLargest(residual, jacobian);
+    const int singular = system.findSingular(from, displacement, jacobian, velocityJacobian);
+    const std::string unresolved = system.explainResolution(worst, from, settings.tolerance);
+    if (singular != ConstraintSystem::NONE)
+        reason << system.describe(singular)
+               << " is close to a singular geometry, in which its gradient is infinite or zero (as that of a dihedral "
+                  "angle over three particles in a line); keep the molecule away from there, or constrain something "
+                  "else";
+    else if (!unresolved.empty())
+        reason << unresolved;
+    else if (std::isfinite(lastError))
+        reason << system.describe(worst) << " could not be solved for (relative error " << lastError << " left)"
+               << wayOut;
+    else if (system.isExpression(worst) && !std::isfinite(residual[worst]))
+        reason << system.describe(worst) << " became " << residual[worst];
+    else
+        reason << "the constraints could not be solved for (the iteration diverged)" << wayOut;
+    return reason.str();
 }

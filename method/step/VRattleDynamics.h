@@ -288,8 +288,8 @@ private:
     double solveRegular();
     void keepOffsets();
     [[noreturn]] void throwNotConverged(const Trial& trial);
-    [[noreturn]] void throwNotConverged(const std::vector<OpenMM::Vec3>& from,
-                                        const std::vector<OpenMM::Vec3>& displacement);
+    std::string explainNotConverged(const std::vector<OpenMM::Vec3>& from,
+                                    const std::vector<OpenMM::Vec3>& displacement, const std::string& wayOut);
 
     double findFirstDensity();
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);

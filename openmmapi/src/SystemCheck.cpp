@@ -77,20 +77,28 @@ void requireExpressions(ContextImpl& context, const vector<ExpressionConstraint>
     }
 }
 
-// A virtual site is where its particles put it, so that a constraint on it would be passed over. (OpenMM refuses a constraint
-// between a particle with mass and one without; two that do not move may be what is left of a frozen molecule.)
-void requireNoConstrainedSites(const System& system) {
+// (OpenMM refuses a constraint between a particle with mass and one without; two that do not move may be what is left of a
+// frozen molecule.) A virtual site is where its particles put it, so that a constraint on it would be passed over.
+void requireConstraints(const System& system) {
     for (int i = 0; i < system.getNumConstraints(); i++) {
         int particle1, particle2;
         double length;
         system.getConstraintParameters(i, particle1, particle2, length);
+        const auto refuse = [&](const string& reason) {
+            throw OpenMMException(PREFIX + "constraint " + std::to_string(i) + " of the System, of the particles " +
+                                  std::to_string(particle1) + " and " + std::to_string(particle2) + ", " + reason);
+        };
+        if (!(length > 0) || !std::isfinite(length)) {
+            std::stringstream number;
+            number << length;
+            refuse(
+                "has a length of " + number.str() +
+                " nm, which is not a positive finite number; correct it with setConstraintParameters() of the System");
+        }
         for (int particle : {particle1, particle2})
             if (system.isVirtualSite(particle))
-                throw OpenMMException(PREFIX + "constraint " + std::to_string(i) + " of the System, of the particles " +
-                                      std::to_string(particle1) + " and " + std::to_string(particle2) +
-                                      ", is of the virtual site " + std::to_string(particle) +
-                                      ", which is where the particles that define it put it and cannot be held; "
-                                      "constrain those");
+                refuse("is of the virtual site " + std::to_string(particle) +
+                       ", which is where the particles that define it put it and cannot be held; constrain those");
     }
 }
 
@@ -193,7 +201,7 @@ void requireKnownGroups(const ContextImpl& context, const ForceImpl& impl,
 void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
     const System& system = context.getSystem();
     requireMasses(system);
-    requireNoConstrainedSites(system);
+    requireConstraints(system);
     requireExpressions(context, expressions);
     for (const ForceImpl* force : context.getForceImpls()) {
         refuseDrudeParticles(*force);

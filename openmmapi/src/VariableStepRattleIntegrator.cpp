@@ -32,6 +32,8 @@ namespace {
 
 // Of the parameters that States hold; the settings among them have a version of their own.
 const int PARAMETERS_VERSION = 1;
+// Its square, by which multipliers act on positions, must not vanish.
+const double SMALLEST_STEP_SIZE = 1e-100;
 const char TYPE_NAME[] = "VariableStepRattleIntegrator";
 
 void requirePositive(double value, const string& name) {
@@ -126,6 +128,12 @@ double VariableStepRattleIntegrator::getNominalStepSize() const {
 
 void VariableStepRattleIntegrator::setNominalStepSize(double size) {
     requirePositiveOrZero(size, "step size", "where no step is to be taken");
+    if (size > 0 && size < SMALLEST_STEP_SIZE) {
+        std::stringstream message;
+        message << "VariableStepRattleIntegrator: a step size of " << size
+                << " ps is too small to compute with; set one of " << SMALLEST_STEP_SIZE << " ps or more";
+        throw OpenMMException(message.str());
+    }
     settings->stepSize = size;
     Integrator::setStepSize(size);
     if (run != nullptr)

@@ -8,6 +8,7 @@ using namespace OpenMMVRattle;
 
 int main(int argc, char** argv) {
     return runOnPlatform({{"masses", testMasses},
+                          {"lengths", testLengths},
                           {"constraints on virtual sites", testConstrainedSites},
                           {"thermostats and expressions", testThermostats},
                           {"barostats and expressions", testBarostats},
@@ -18,6 +19,9 @@ int main(int argc, char** argv) {
                           {"a ring through the box", testRingThroughTheBox},
                           {"a wrapped particle on a sphere", testWrappedParticleOnSphere},
                           {"positions", testPositions},
+                          {"positions far out", testPositionsFarOut},
+                          {"the smallest step", testSmallestStep},
+                          {"constraints that contradict each other", testConstraintsThatContradictEachOther},
                           {"velocities that are too fast", testFastVelocities},
                           {"velocities of coupled constraints", testVelocitiesOfCoupledConstraints},
                           {"the distribution of velocities", testMaxwellVelocities},
