@@ -16,9 +16,13 @@ DOCS_TOOLS := $(VENV)/.docs-tools-installed
 PACKAGE_TOOLS := $(VENV)/.package-tools-installed
 # What `make wheel` and `make sdist` give to pytest, for example "-k wrapper".
 PYTEST_ARGUMENTS ?=
+# Where `make test` leaves its results, as JUnit XML.
+CXX_REPORT ?= $(abspath $(BUILD))/cxx-tests.xml
+PYTHON_REPORT ?= $(abspath $(BUILD))/python-tests.xml
+comma := ,
 CXX_FILES = $(shell find openmmapi method platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize scaling python-test docs pictures wheel sdist conda install format clean
+.PHONY: all demo test check-format cxx-test sanitize sanitize-threads scaling python-test claims docs pictures wheel sdist conda install format clean
 
 all: test
 
@@ -37,34 +41,46 @@ check-format: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/clang-format --dry-run --Werror $(CXX_FILES)
 
+# configure FOLDER OPTIONS: CMake for the C++ tests and benchmarks.
+configure = $(BIN)/cmake -S . -B $(1) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
+	-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF $(2)
+
 cxx-test: $(TOOLS)
-	$(BIN)/cmake -S . -B $(BUILD) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
-		-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF
+	$(call configure,$(BUILD))
 	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
-	$(BIN)/ctest --test-dir $(BUILD) --output-on-failure --no-tests=error
+	$(BIN)/ctest --test-dir $(BUILD) --parallel $(JOBS) --output-on-failure --no-tests=error --output-junit "$(CXX_REPORT)"
 
 # The C++ tests with AddressSanitizer (with its search for leaks) and UndefinedBehaviorSanitizer, GCC or Clang; about three
 # minutes. OpenMM's own libraries are not instrumented: only memory that our code reads, writes or forgets is watched.
 # Leak reports need frame pointers to tell whose memory it was.
 sanitize: $(TOOLS)
-	$(BIN)/cmake -S . -B $(SANITIZE_BUILD) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
-		-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF -DCMAKE_BUILD_TYPE=RelWithDebInfo \
-		-DCMAKE_CXX_FLAGS="-O1 -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
+	$(call configure,$(SANITIZE_BUILD),-DCMAKE_BUILD_TYPE=RelWithDebInfo \
+		-DCMAKE_CXX_FLAGS="-O1 -fsanitize=address$(comma)undefined -fno-sanitize-recover=all -fno-omit-frame-pointer")
 	$(BIN)/cmake --build $(SANITIZE_BUILD) --parallel $(JOBS)
 	ASAN_OPTIONS=detect_leaks=1:strict_string_checks=1:detect_stack_use_after_return=1 UBSAN_OPTIONS=print_stacktrace=1 \
 		$(BIN)/ctest --test-dir $(SANITIZE_BUILD) --output-on-failure --no-tests=error
 
+# The C++ tests that share work among threads, with ThreadSanitizer; about three minutes.
+sanitize-threads: $(TOOLS)
+	$(call configure,$(SANITIZE_BUILD)-threads,-DCMAKE_BUILD_TYPE=RelWithDebInfo \
+		-DCMAKE_CXX_FLAGS="-O1 -fsanitize=thread -fno-omit-frame-pointer")
+	$(BIN)/cmake --build $(SANITIZE_BUILD)-threads --parallel $(JOBS) --target TestDynamicsThreads
+	TSAN_OPTIONS=halt_on_error=1 \
+		$(BIN)/ctest --test-dir $(SANITIZE_BUILD)-threads -R Threads --output-on-failure --no-tests=error
+
 # How the cost of the constraint solver grows with the number of constraints; about five minutes, a minute and a half of it for
 # OpenMM to create a Context with 200,000 bonds.
 scaling: install $(TOOLS)
-	$(BIN)/cmake -S . -B $(BUILD) -G Ninja -DPython_EXECUTABLE="$(abspath $(BIN)/python)" \
-		-DCMAKE_MAKE_PROGRAM="$(abspath $(BIN)/ninja)" -DOPENMMVRATTLE_BUILD_PYTHON=OFF \
-		-DOPENMMVRATTLE_BUILD_BENCHMARKS=ON
+	$(call configure,$(BUILD),-DOPENMMVRATTLE_BUILD_BENCHMARKS=ON)
 	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
 	$(BIN)/python benchmarks/scaling.py --program $(BUILD)/benchmarks/VRattleSolverBenchmark --context 200000
 
 python-test: install $(TOOLS)
-	$(BIN)/python -m pytest python/tests
+	$(BIN)/python -m pytest python/tests --junitxml="$(PYTHON_REPORT)"
+
+# The numbers that README and documentation claim, measured: gains, drift, the paper's figures. Minutes on an idle machine.
+claims: install $(TOOLS)
+	$(BIN)/python -m pytest python/tests -m claims
 
 # The documentation as HTML in docs/_build/html; warnings are errors.
 docs: install $(DOCS_TOOLS)
@@ -116,7 +132,7 @@ format: $(TOOLS)
 	$(BIN)/clang-format -i $(CXX_FILES)
 
 clean:
-	rm -rf $(BUILD) $(SANITIZE_BUILD) docs/_build dist out $(VENV)
+	rm -rf $(BUILD) $(SANITIZE_BUILD) $(SANITIZE_BUILD)-threads docs/_build dist out $(VENV)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -63,7 +63,17 @@ VERDICTS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "evaluations", "verdict", "lowest", "highest"), VERDICTS, ids=lambda x: str(x))
+# Of each verdict one here, and all with the claims.
+QUICK_VERDICTS = ("light-heavy-chain", "ion-pair", "rigid-waters")
+
+
+@pytest.mark.parametrize(
+    ("name", "evaluations", "verdict", "lowest", "highest"),
+    [
+        pytest.param(*case, marks=[] if case[0] in QUICK_VERDICTS else [pytest.mark.claims], id=case[0])
+        for case in VERDICTS
+    ],
+)
 def test_the_verdict_is_what_is_measured(name, evaluations, verdict, lowest, highest):
     """At an equal number of force evaluations: where it says variable steps, they win, and nowhere else."""
     advice, start = advice_on(name, evaluations)

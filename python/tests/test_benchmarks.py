@@ -110,6 +110,7 @@ def test_wrong_usage_is_refused(tmp_path, arguments):
 @pytest.mark.parametrize(
     "name", ["pendulum", "whip", "whip-with-repulsion", "water-clash", "alanine-dipeptide-hbonds", "rigid-waters"]
 )
+@pytest.mark.claims
 def test_claim_is_met(script, tmp_path, name):
     output = run_script(tmp_path, "--claims", name, "--jobs", "2")
     (result,) = lines_of(tmp_path / "claims.jsonl")

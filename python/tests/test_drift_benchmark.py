@@ -60,6 +60,7 @@ def test_verdict_can_fail(drift: ModuleType) -> None:
     assert len(drift.verdict([run("VRATTLE U2", 0.0, 1.2e-8), verlet])) == 1
 
 
+@pytest.mark.claims
 def test_quick_run(drift: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     assert drift.main(["--quick", "--output", str(tmp_path)]) == 0

@@ -56,6 +56,7 @@ def study(finished: tuple[Any, Path]) -> Any:
     return finished[0]
 
 
+@pytest.mark.claims
 def test_comparisons_are_fair(study: Any) -> None:
     """The same number of force evaluations, one a step and one at the start, over the same time; every step seen."""
     assert len(study.trials) == 5 and len(study.exchanged) == 4
@@ -82,6 +83,7 @@ def test_energy_of_the_start(example: ModuleType) -> None:
     np.testing.assert_allclose(np.linalg.norm(outer - inner, axis=1), 1, rtol=1e-7)
 
 
+@pytest.mark.claims
 def test_u1_does_not_remove_the_peaks(study: Any) -> None:
     """U1 is dominated by the constant weight of the heavy bob: its steps are fixed ones within 1 %."""
     trial = study.trials["U1"]
@@ -93,6 +95,7 @@ def test_u1_does_not_remove_the_peaks(study: Any) -> None:
     assert errors.max() > 1000 * np.median(errors)
 
 
+@pytest.mark.claims
 def test_u2_removes_the_peaks(study: Any) -> None:
     """Measured 21,000 and 23,000: far from the bar, for a different phase of RATTLE's steps makes a factor of 2."""
     u2 = study.trials["U2"]
@@ -106,6 +109,7 @@ def test_u2_removes_the_peaks(study: Any) -> None:
     assert gauss.variable.force_evaluations < u2.variable.force_evaluations
 
 
+@pytest.mark.claims
 def test_steps_of_u2(study: Any) -> None:
     """Up to nearly its bound of 0.02 ps and down to its bound of 1e-6 ps, where U1 stays at 1e-4 ps."""
     u1, u2 = study.trials["U1"].variable, study.trials["U2"].variable
@@ -118,12 +122,14 @@ def test_steps_of_u2(study: Any) -> None:
     assert u2.rescues == 0
 
 
+@pytest.mark.claims
 def test_constraint_force_along_the_run(study: Any) -> None:
     """From less than 0.05 to more than 1e6 kJ/mol/nm^2: more than seven orders of magnitude."""
     multipliers = study.trials["U1"].fixed.multipliers
     assert multipliers.min() < 0.05 and multipliers.max() > 1e6
 
 
+@pytest.mark.claims
 def test_masses_exchanged(study: Any) -> None:
     """With the heavy bob inside all are equal within a factor of 2, as long as the growth of the step is limited."""
     for name in ("U1", "U2", "Gauss"):
@@ -135,6 +141,7 @@ def test_masses_exchanged(study: Any) -> None:
     assert free.variable.largest_step > 20 * study.exchanged["U2"].variable.largest_step
 
 
+@pytest.mark.claims
 def test_claims(example: ModuleType, study: Any) -> None:
     claims = example.judge_claims(study)
     verdicts = {claim.claim: claim.held for claim in claims}
@@ -147,6 +154,7 @@ def test_claims(example: ModuleType, study: Any) -> None:
         assert claim.held == (claim.number >= float(claim.bar.removeprefix("at least ")))
 
 
+@pytest.mark.claims
 def test_claims_can_fail(example: ModuleType, study: Any) -> None:
     """Of a U2 that is no better than fixed steps the script says so."""
     u1 = study.trials["U1"]
@@ -162,6 +170,7 @@ def test_claims_can_fail(example: ModuleType, study: Any) -> None:
         assert held[text] is False
 
 
+@pytest.mark.claims
 def test_files(example: ModuleType, finished: tuple[Any, Path]) -> None:
     study, folder = finished
     names = {"table.csv", "claims.json"} | {f"figure-4-{n}.png" for n in (1, 2, 3, 4)}
@@ -183,6 +192,7 @@ def test_files(example: ModuleType, finished: tuple[Any, Path]) -> None:
     assert [claim["number"] for claim in content["claims"]] == [c.number for c in example.judge_claims(study)]
 
 
+@pytest.mark.claims
 def test_output(example: ModuleType, study: Any) -> None:
     """One line for each method and each claim, which says what the number is."""
     console = example.Console(width=400, record=True, file=io.StringIO())

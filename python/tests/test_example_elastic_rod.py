@@ -57,6 +57,7 @@ def study(finished: tuple[Any, Path]) -> Any:
     return finished[0]
 
 
+@pytest.mark.claims
 def test_comparisons_are_fair(example: ModuleType, study: Any) -> None:
     """The same number of force evaluations, one a step and one at the start, over the same time; every step seen."""
     assert len(study.trials) == 10
@@ -72,6 +73,7 @@ def test_comparisons_are_fair(example: ModuleType, study: Any) -> None:
                 assert variable.steps == pytest.approx(number, rel=0.15)
 
 
+@pytest.mark.claims
 def test_runs_start_where_they_should(study: Any) -> None:
     """The energy of the start; the first step has the nominal size; the rod keeps its length."""
     for trials in study.trials.values():
@@ -83,6 +85,7 @@ def test_runs_start_where_they_should(study: Any) -> None:
         assert np.max(np.abs(rod.g(points.ravel()))) < 1e-8
 
 
+@pytest.mark.claims
 def test_nearness_is_that_of_the_walls(example: ModuleType, study: Any) -> None:
     run = study.same_step[0.02][0].variable
     dense = [Rod().nearness(points.ravel(), 1.0) for points in run.positions]
@@ -91,6 +94,7 @@ def test_nearness_is_that_of_the_walls(example: ModuleType, study: Any) -> None:
     np.testing.assert_allclose(run.densities[1:] + run.densities[:-1], 2 * run.nearness[1:-1] ** 3, rtol=1e-9)
 
 
+@pytest.mark.claims
 def test_gains(study: Any) -> None:
     """What prototypes measured at 350 and 1,000 steps: 2.4 to 6.7 with U3, 0.4 to 1.1 with U2 and Gauss."""
     expected = {"U3, a = 1": 2.4, "U3, a = 2": 4.7, "U3, a = 3": 6.7, "U3, a = 3, simple start": 6.5}
@@ -104,6 +108,7 @@ def test_gains(study: Any) -> None:
     assert all(1.2 < trial.gain < 2.2 for trial in study.trials["vector field"])
 
 
+@pytest.mark.claims
 def test_figure_5_4(study: Any) -> None:
     """163 steps of VRATTLE beat 338 of RATTLE."""
     equal, double = study.same_step[0.02][0], study.same_step[0.04][0].variable
@@ -113,6 +118,7 @@ def test_figure_5_4(study: Any) -> None:
     assert equal.gain > 5
 
 
+@pytest.mark.claims
 def test_recursion_of_the_density(study: Any) -> None:
     """(3.15), rho + rho' = 2 U, for the recursion in the script as for the integrator's; and where each starts."""
     for starts in study.starts.values():
@@ -126,6 +132,7 @@ def test_recursion_of_the_density(study: Any) -> None:
     assert study.starts[0.0].simple.nearness[0] == pytest.approx(1 / 0.65, rel=1e-12)
 
 
+@pytest.mark.claims
 def test_starts(example: ModuleType, study: Any) -> None:
     """From t = 0.06 the extrapolated start reduces the oscillation 5.5-fold; from t = 0 it doubles it, unlike ours."""
     amplitudes = {}
@@ -148,6 +155,7 @@ def test_oscillation_is_what_alternates(example: ModuleType) -> None:
     assert example.oscillation_at(sequence, 0) == pytest.approx(0.3, rel=1e-3)
 
 
+@pytest.mark.claims
 def test_claims(example: ModuleType, study: Any) -> None:
     """Those that hold, and those that do not."""
     claims = {claim.claim: claim for claim in example.judge_claims(study)}
@@ -160,6 +168,7 @@ def test_claims(example: ModuleType, study: Any) -> None:
     }
 
 
+@pytest.mark.claims
 def test_findings(example: ModuleType, study: Any) -> None:
     findings = {finding.finding: finding.number for finding in example.other_findings(study)}
     assert all(math.isfinite(number) for number in findings.values())
@@ -170,6 +179,7 @@ def test_findings(example: ModuleType, study: Any) -> None:
     assert smooth > findings["U3, 1,000 steps: gain with the maximum"]
 
 
+@pytest.mark.claims
 def test_files(example: ModuleType, finished: tuple[Any, Path]) -> None:
     study, folder = finished
     names = {"table.csv", "claims.json"} | {f"figure-5-{n}.png" for n in (2, 3, 4, 5, 6)}
@@ -189,6 +199,7 @@ def test_files(example: ModuleType, finished: tuple[Any, Path]) -> None:
     assert [claim["number"] for claim in content["claims"]] == [c.number for c in example.judge_claims(study)]
 
 
+@pytest.mark.claims
 def test_output(example: ModuleType, study: Any) -> None:
     """One line for each method and each claim, which says what the number is."""
     console = example.Console(width=400, record=True, file=io.StringIO())

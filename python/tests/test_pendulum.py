@@ -30,6 +30,7 @@ def pendulum_run(integrator: Any, steps: int | None) -> tuple[float, int]:
     return worst, count
 
 
+@pytest.mark.claims
 def test_energy_at_equal_cost() -> None:
     """U2 between bounds of 1e-6 and 0.02 ps against plain RATTLE with as many force evaluations."""
     integrator = VariableStepRattleIntegrator(0.01)
