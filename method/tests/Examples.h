@@ -41,6 +41,16 @@ struct Example {
         const OpenMM::Vec3 r = positions[i] - positions[j];
         distances.push_back({i, j, std::sqrt(r.dot(r))});
     }
+    /** Particles about a random place, joined as the pairs say. */
+    void addCluster(const std::vector<double>& clusterMasses, const std::vector<std::pair<int, int>>& pairs,
+                    const std::vector<OpenMM::Vec3>& shape) {
+        const int first = (int) masses.size();
+        const OpenMM::Vec3 place = randomVector(3);
+        for (size_t i = 0; i < clusterMasses.size(); i++)
+            add(clusterMasses[i], place + shape[i]);
+        for (const auto& pair : pairs)
+            join(first + pair.first, first + pair.second);
+    }
     void addWater(const OpenMM::Vec3& place) {
         const int oxygen = add(16, place), one = add(1, place + OpenMM::Vec3(0.08, 0.06, 0)),
                   other = add(1, place + OpenMM::Vec3(-0.08, 0.06, 0));

@@ -1,19 +1,17 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// Clusters so large that they are cut into pieces: the cut, K and the steps against Eigen's sparse factorisation of the same matrix,
-// and the same bits with any number of threads.
+// Clusters so large that they are cut into pieces: the cut, K and the steps against Eigen's sparse factorisation of the same
+// matrix.
 
 #include "Examples.h"
 #include "TestSupport.h"
 #include "constraints/ClusterCut.h"
 #include <Eigen/SparseCholesky>
 #include <Eigen/SparseCore>
-#include <atomic>
 #include <cmath>
 #include <random>
 #include <set>
-#include <thread>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -236,65 +234,6 @@ void testProjection(const Example& e) {
     ASSERT(system.evaluate(positions, g, jacobian) <= 1e-10);
 }
 
-void testThreads(const Example& e) {
-    const VRattleDynamics::Settings automatic = {0.002, 0,     0,    1e-10,        StepDensity::SemiExplicit,
-                                                 {},    false, true, {3000, 3000}, 0};
-    for (const VRattleDynamics::Settings& settings :
-         {makeSettings(StepDensity::SemiExplicit), makeSettings(StepDensity::Explicit), automatic}) {
-        vector<Vec3> positions;
-        vector<double> multipliers;
-        for (int numThreads : {1, 2, 3, 8}) {
-            VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
-            int calls = 0;
-            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
-            dynamics.setSettings(settings);
-            dynamics.begin(e.positions, e.velocities, forcesAt(e.positions), 0);
-            if (settings.isAutomatic)
-                dynamics.startAutomatic({3300, 3200}, {3100, 3000});
-            takeSteps(dynamics, ThreadChoice::RUN_LENGTH + 3); // the last ones on one thread
-            ASSERT((calls > 0) == (numThreads > 1));
-            if (numThreads == 1) {
-                positions = dynamics.getPositions();
-                multipliers = dynamics.getMultipliers();
-            }
-            ASSERT(positions == dynamics.getPositions());
-            ASSERT(multipliers == dynamics.getMultipliers());
-        }
-    }
-}
-
-// What a task throws on some thread ends as an exception of the caller, and the work can go on.
-void testExceptions(const Example& e) {
-    const ConstraintSystem system(e.masses, e.distances, e.expressions);
-    const int numThreads = 3;
-    SharedWork work(system);
-    work.setParallel(
-        [&](const std::function<void(int)>& task) {
-            vector<std::thread> threads;
-            for (int thread = 1; thread < numThreads; thread++)
-                threads.emplace_back([&task, thread] { task(thread); });
-            task(0);
-            for (std::thread& thread : threads)
-                thread.join();
-        },
-        numThreads);
-    const int last = (int) system.getPieces().size() - 1;
-    for (const vector<int>& failing : {vector<int>{0}, vector<int>{last}, vector<int>{0, last / 2, last}}) {
-        std::atomic<int> count(0);
-        auto visit = [&](const ConstraintSystem::Part& piece, SharedWork::Result&) {
-            count++;
-            if (std::find(failing.begin(), failing.end(), piece.piece) != failing.end())
-                throw StepFailure("piece " + std::to_string(piece.piece));
-        };
-        const int before = count;
-        assertThrows("piece " + std::to_string(failing[0]), [&] { work.runOnPieces(visit); });
-        ASSERT(count - before >= (int) failing.size());
-    }
-    std::atomic<int> count(0);
-    work.runOnPieces([&](const ConstraintSystem::Part&, SharedWork::Result&) { count++; });
-    ASSERT_EQUAL(last + 1, (int) count);
-}
-
 // A doubled bond is found within a piece and among the joints.
 void testDependentConstraints(const Example& e) {
     const ConstraintSystem whole(e.masses, e.distances, e.expressions);
@@ -323,9 +262,6 @@ int main() {
         {"steps of a comb, Bounded", [&] { testSteps(comb, StepDensity::Bounded); }},
         {"steps of a rod, SemiExplicit", [&] { testSteps(rod, StepDensity::SemiExplicit); }},
         {"steps of a rod, Explicit", [&] { testSteps(rod, StepDensity::Explicit); }},
-        {"any number of threads, a comb", [&] { testThreads(comb); }},
-        {"any number of threads, a rod", [&] { testThreads(rod); }},
-        {"exceptions on threads", [&] { testExceptions(comb); }},
         {"dependent constraints", [&] { testDependentConstraints(comb); }},
     });
 }

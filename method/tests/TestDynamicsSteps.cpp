@@ -2,44 +2,16 @@
 // SPDX-License-Identifier: MIT
 
 // VRattleDynamics with forces of its own: clusters of every shape that has kernels, in odd and even numbers, beside
-// general ones, against a dense statement of the multipliers; and the same bits with any number of threads.
+// general ones, against a dense statement of the multipliers.
 
+#include "Examples.h"
 #include "TestSupport.h"
-#include "step/VRattleDynamics.h"
 #include <Eigen/Dense>
 #include <cmath>
-#include <random>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
-
-struct Example {
-    vector<double> masses;
-    vector<DistanceConstraint> constraints;
-    vector<Vec3> positions, velocities;
-    std::mt19937 random{5};
-
-    Vec3 randomVector(double scale) {
-        std::normal_distribution<double> normal;
-        return Vec3(normal(random), normal(random), normal(random)) * scale;
-    }
-    // Particles about a place, joined as the pairs say, by constraints as long as their distances happen to be.
-    void addCluster(const vector<double>& clusterMasses, const vector<std::pair<int, int>>& pairs,
-                    const vector<Vec3>& shape) {
-        const int first = (int) masses.size();
-        const Vec3 place = randomVector(2);
-        for (size_t i = 0; i < clusterMasses.size(); i++) {
-            masses.push_back(clusterMasses[i]);
-            positions.push_back(place + shape[i]);
-            velocities.push_back(randomVector(0.5));
-        }
-        for (const auto& pair : pairs) {
-            Vec3 r = shape[pair.first] - shape[pair.second];
-            constraints.push_back({first + pair.first, first + pair.second, std::sqrt(r.dot(r))});
-        }
-    }
-};
 
 static const vector<Vec3> SHAPE = {Vec3(), Vec3(0.1, 0, 0.01), Vec3(-0.03, 0.11, 0), Vec3(-0.02, -0.05, 0.09),
                                    Vec3(-0.04, -0.05, -0.1)};
@@ -58,7 +30,7 @@ static void makeExample(Example& e, int copies) {
 }
 
 // Springs to the origin, one stiffness each, and a pull along the velocity-free direction (1, 2, -1).
-static vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+static vector<Vec3> springsAt(const vector<Vec3>& positions) {
     vector<Vec3> forces;
     for (size_t i = 0; i < positions.size(); i++)
         forces.push_back(positions[i] * (-20.0 - (double) (i % 7)) + Vec3(1, 2, -1) * (double) (i % 5));
@@ -72,20 +44,13 @@ static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
 // Both halves of a step; returns whether it is complete.
 static bool takeStep(VRattleDynamics& dynamics) {
     dynamics.step(INFINITY);
-    vector<Vec3> forces = forcesAt(dynamics.getNextPositions());
+    vector<Vec3> forces = springsAt(dynamics.getNextPositions());
     return dynamics.finish(forces, 0);
 }
 
-static VRattleDynamics::Settings makeAutomaticSettings() {
-    // References far below the monitors' values, so that the density is not 1.
-    return {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, false, true, {30, 20}, 0};
-}
-
-static void run(VRattleDynamics& dynamics, const Example& e, int steps, bool isAutomatic = false) {
+static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
     vector<Vec3> positions = e.positions;
-    dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
-    if (isAutomatic)
-        dynamics.startAutomatic({120, 150}, {110, 140});
+    dynamics.begin(positions, e.velocities, springsAt(positions), 0);
     for (int i = 0; i < steps; i++)
         while (!takeStep(dynamics)) {
         }
@@ -93,7 +58,7 @@ static void run(VRattleDynamics& dynamics, const Example& e, int steps, bool isA
 
 // Lambda = K^-1 (g''(v,v) + G M^-1 F) for g = |r|^2 - d^2, in the order of the constraints.
 static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleDynamics& dynamics) {
-    const int m = (int) e.constraints.size(), n = 3 * (int) e.masses.size();
+    const int m = (int) e.distances.size(), n = 3 * (int) e.masses.size();
     Eigen::MatrixXd g = Eigen::MatrixXd::Zero(m, n);
     Eigen::VectorXd curvature(m), force(n), inverseMass(n);
     const vector<Vec3>&q = dynamics.getPositions(), &v = dynamics.getVelocities(), &f = dynamics.getForces();
@@ -102,14 +67,14 @@ static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleDynamics&
         inverseMass[i] = 1 / e.masses[i / 3];
     }
     for (int k = 0; k < m; k++) {
-        const int a = e.constraints[k].particle1, b = e.constraints[k].particle2;
+        const int a = e.distances[k].particle1, b = e.distances[k].particle2;
         Vec3 r = q[a] - q[b], w = v[a] - v[b];
         for (int j = 0; j < 3; j++) {
             g(k, 3 * a + j) = 2 * r[j];
             g(k, 3 * b + j) = -2 * r[j];
         }
         curvature[k] = 2 * w.dot(w);
-        ASSERT(std::fabs(std::sqrt(r.dot(r)) / e.constraints[k].length - 1) <= 1e-10);
+        ASSERT(std::fabs(std::sqrt(r.dot(r)) / e.distances[k].length - 1) <= 1e-10);
         ASSERT(std::fabs(r.dot(w)) < 1e-11); // the velocities are tangent
     }
     Eigen::MatrixXd k = g * inverseMass.asDiagonal() * g.transpose();
@@ -120,9 +85,9 @@ void testShapes(StepDensity::Update update) {
     for (int copies : {1, 2, 3}) {
         Example e;
         makeExample(e, copies);
-        VRattleDynamics dynamics(e.masses, e.constraints);
+        VRattleDynamics dynamics(e.masses, e.distances);
         ASSERT(dynamics.getConstraintSystem().getBatches().size() == 5);
-        ASSERT_EQUAL((int) e.constraints.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
+        ASSERT_EQUAL((int) e.distances.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
         dynamics.setSettings(makeSettings(update));
         run(dynamics, e, 1);
         const double reference = dynamics.getReferences()[0];
@@ -163,7 +128,7 @@ void testChangedFrame() {
     };
     const Vec3 shift(0.3, -2, 0.7);
     for (auto kind : {StepMonitor::ConstraintMultipliers, StepMonitor::VectorField}) {
-        VRattleDynamics resting(e.masses, e.constraints), moving(e.masses, e.constraints);
+        VRattleDynamics resting(e.masses, e.distances), moving(e.masses, e.distances);
         for (VRattleDynamics* dynamics : {&resting, &moving}) {
             VRattleDynamics::Settings settings = makeSettings(StepDensity::SemiExplicit);
             settings.terms[0].kind = kind;
@@ -208,7 +173,7 @@ void testFailedSteps() {
                                      {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
                     if (isGeneral)
                         makeExample(e, 1);
-                    VRattleDynamics tried(e.masses, e.constraints), untried(e.masses, e.constraints);
+                    VRattleDynamics tried(e.masses, e.distances), untried(e.masses, e.distances);
                     for (VRattleDynamics* dynamics : {&tried, &untried}) {
                         VRattleDynamics::Settings settings = makeSettings(update);
                         settings.terms[0].kind = kind;
@@ -216,7 +181,7 @@ void testFailedSteps() {
                         run(*dynamics, e, 5);
                         if (dynamics == &tried) {
                             dynamics->step(INFINITY);
-                            vector<Vec3> forces = forcesAt(dynamics->getNextPositions());
+                            vector<Vec3> forces = springsAt(dynamics->getNextPositions());
                             forces[0][1] = NAN;
                             assertThrows("not a number", [&] { dynamics->finish(forces, 0); });
                             dynamics->abandonStep();
@@ -245,35 +210,6 @@ void testFailedSteps() {
                 }
 }
 
-void testThreads() {
-    // Enough waters, and an odd number of them, for the batches to be shared.
-    Example e;
-    for (int i = 0; i < 4001; i++)
-        e.addCluster({16, 1, 1}, {{0, 1}, {0, 2}, {1, 2}}, {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
-    const VRattleDynamics::Settings all[] = {makeSettings(StepDensity::SemiExplicit),
-                                             makeSettings(StepDensity::Explicit), makeAutomaticSettings()};
-    for (const VRattleDynamics::Settings& settings : all) {
-        vector<Vec3> positions;
-        double density = 0;
-        for (int numThreads : {1, 2, 3, 8}) {
-            VRattleDynamics dynamics(e.masses, e.constraints);
-            int calls = 0;
-            dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
-            dynamics.setSettings(settings);
-            run(dynamics, e, ThreadChoice::RUN_LENGTH + 3, settings.isAutomatic); // the last ones on one thread
-            ASSERT((calls > 0) == (numThreads > 1));
-            if (numThreads == 1) {
-                positions = dynamics.getPositions();
-                density = dynamics.getDensity();
-            }
-            for (size_t i = 0; i < positions.size(); i++)
-                ASSERT_EQUAL_VEC(positions[i], dynamics.getPositions()[i], 0.0);
-            ASSERT_EQUAL(density, dynamics.getDensity());
-            ASSERT(density != 1);
-        }
-    }
-}
-
 // Whichever way is faster is chosen, whatever single steps took, and found again when it changes.
 void testThreadChoice() {
     ThreadChoice choice;
@@ -297,7 +233,6 @@ int main() {
         {"clusters of every shape, Bounded", [] { testShapes(StepDensity::Bounded); }},
         {"another frame of reference", testChangedFrame},
         {"steps that fail", testFailedSteps},
-        {"any number of threads", testThreads},
         {"the choice of threads", testThreadChoice},
     });
 }
