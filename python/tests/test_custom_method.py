@@ -73,6 +73,7 @@ def test_every_step_satisfies_the_equations(name: str, update: str) -> None:
     assert max(densities) / min(densities) > 1.02
 
 
+# Waters not on CPU: its nonbonded forces are of single precision, and differ where positions differ by rounding.
 # On OpenCL the waters and the methyls only: OpenMM's constraint solver there is not exact enough for the others, see
 # the test of the limits; and in single precision the waters, whose constraint forces are large. Bounded is the same
 # program there as SemiExplicit but for one formula, and compiling takes seconds.
@@ -81,6 +82,7 @@ THERE_AND_BACK = [
     for name in ("waters", "pendulum", "chain", "ring", "methyls")
     for platform in ("Reference", "CPU")
     for update in ("SemiExplicit", "Bounded")
+    if (name, platform) != ("waters", "CPU")
 ] + [
     (name, "OpenCL", precision, tolerance, bound, update)
     for precision, tolerance, bound in (("double", 1e-12, 1e-8), ("mixed", 1e-8, 1e-6), ("single", 1e-5, 1e-3))
@@ -105,7 +107,7 @@ def test_there_and_back(name: str, platform: str, precision: str, tolerance: flo
     back = largest(positions_of(context) - model.positions)
     print(f"{name} on {platform} ({precision}): back to {back:.1e} nm of the start")
     assert largest(turning - model.positions) > 0.02
-    assert back < (1e-12 if name == "waters" and platform in ("Reference", "CPU") else bound)
+    assert back < (1e-12 if name == "waters" and platform == "Reference" else bound)
     assert time_of(context) == pytest.approx(2 * time, rel=1e-2)
     assert integrator.getNumRescues() == 0
 
@@ -290,7 +292,10 @@ def test_energy_on_every_platform(platform: str, precision: str, bound: float) -
     expected, measured = error("Reference", "double"), error(platform, precision)
     print(platform, precision, measured, "Reference", expected)
     assert measured[0] == pytest.approx(expected[0], rel=bound)
-    assert measured[1:] == pytest.approx(expected[1:], rel={"single": 1e-3, "mixed": 1e-5, "double": 1e-6}[precision])
+    # CPU computes nonbonded forces in single precision, whatever else is double. A relative change of 1e-5 in the
+    # forces changes u as much, and ten times as much after 0.15 ps, in which nearby trajectories of water separate.
+    accuracy = 1e-3 if platform == "CPU" else {"single": 1e-3, "mixed": 1e-5, "double": 1e-6}[precision]
+    assert measured[1:] == pytest.approx(expected[1:], rel=accuracy)
 
 
 def oscillation(densities: np.ndarray) -> float:

@@ -247,11 +247,11 @@ def test_redundant_framework(platform: str) -> None:
     assert named_particles(str(caught.value)) == {3, 4, 5, 6, 7}, str(caught.value)
 
 
-FLAT_MONITORS = [None, "ConstraintMultipliers", "ConstraintForce", "ConstraintAndAppliedForce"]
+FLAT_MONITORS = [None, "ConstraintMultipliers", "ConstraintForce"]
 
 
 @pytest.mark.parametrize("monitor", FLAT_MONITORS)
-@pytest.mark.parametrize("missed_by", [0.0, 1e-7, 1e-5, 1e-3, 0.5])
+@pytest.mark.parametrize("missed_by", [0.0, 1e-5, 0.5])
 def test_run_into_a_flat_rhombus(missed_by: float, monitor: str | None, platform: str) -> None:
     """Four equal rods, hinged into a ring of equal masses, fold together at a constant angular velocity.
 

@@ -527,8 +527,9 @@ def test_plain_rattle_is_openmms_velocity_verlet(make: Any, platform: str) -> No
     for _ in range(100):
         ours.step(1)
         theirs.step(1)
-        # Both to 1e-12, and the growth of small errors along 0.1 ps. (CPU: the same single-precision forces in both.)
-        atol = 1e-9 if platform == "Reference" else 1e-6
+        # Both to 1e-12, and the growth of small errors along 0.1 ps. CPU computes nonbonded forces in single precision,
+        # so that they change where positions do by rounding: by 1e-5 of the 500 nm/ps^2 of a hydrogen along 0.1 ps.
+        atol = 1e-4 if platform == "CPU" and make is waters else 1e-9
         np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=atol)
         np.testing.assert_allclose(velocities_of(context), velocities_of(other), rtol=0, atol=100 * atol)
     assert np.max(np.abs(positions_of(context) - model.positions)) > 0.01

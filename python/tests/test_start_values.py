@@ -131,9 +131,8 @@ def slope(steps: tuple[float, ...], amplitudes: Array) -> float:
     return float(np.polyfit(np.log(steps), np.log(amplitudes), 1)[0])
 
 
-@pytest.mark.parametrize("factor", [0.0, 0.5, 1.7])
 @pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("name", MOVING)
+@pytest.mark.parametrize(("name", "factor"), [("chain", 0.0), ("chain", 0.5), ("chain", 1.7), ("pendulum", 1.7)])
 def test_start_in_motion(name: str, update: str, factor: float) -> None:
     """At least ten times less oscillation than with rho = U at the same step size, and of second order in it."""
     make, time, steps = MOVING[name]
@@ -147,7 +146,7 @@ def test_start_in_motion(name: str, update: str, factor: float) -> None:
     assert slope(steps, ours) > 1.9
 
 
-@pytest.mark.parametrize("factor", [0.0, 0.5, 1.7])
+@pytest.mark.parametrize("factor", [0.0, 1.7])
 @pytest.mark.parametrize("update", UPDATES)
 def test_start_at_rest(update: str, factor: float) -> None:
     """At rest u' = 0, and rho = U is itself the smooth start of (3.15): it must be kept.
