@@ -724,7 +724,9 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             super().setConstraintTolerance(_SINGLE_PRECISION_TOLERANCE)
         # What the constraints leave dominates: a smaller tolerance of the density makes a run no more reversible.
         rounding = {"single": 2e-4, "mixed": 1e-9}.get(run.precision, 1e-11)
-        self._set("solverTolerance", max(min(10 * self.getConstraintTolerance(), 1e-5), rounding))
+        tolerance = max(min(10 * self.getConstraintTolerance(), 1e-5), rounding)
+        if self._get("solverTolerance") != tolerance:
+            self._set("solverTolerance", tolerance)
 
     def _advance(self, run: Run, steps: int) -> None:
         """Take steps, the first of which may be a first one of a sequence of densities."""
@@ -796,7 +798,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         if not self._get("moved"):
             # The step was completed, so the program would take this state for one that the user has changed.
             self._know_state(context)
-        for name, value in variables.items():
+        for name, value in ({"prescribed": 0.0} | variables).items():
             self._set(name, value)
         self._set("moved", 0.0)
 

@@ -57,6 +57,12 @@ class Program:
     def update_context_state(self) -> None:
         self.steps.append(("addUpdateContextState",))
 
+    def changes(self, variable: str) -> bool:
+        """Whether a step changes a global variable."""
+        return any(
+            step[:2] in {("addComputeGlobal", f"${variable}"), ("addComputeSum", f"${variable}")} for step in self.steps
+        )
+
     @contextmanager
     def block(self, condition: str, kind: str = "beginIfBlock") -> Iterator[None]:
         """Steps that are taken if a condition holds."""
@@ -144,34 +150,36 @@ _OF_ONE_STEP = {
     *("entering", "fresh", "changed", "change", "known", "phase", "nextPhase", "back", "sigma", "trial", "iterate"),
     *("count", "solved", "failed", "target", "residual", "lastTrial", "lastTarget", "lastResidual", "uPlus", "uOld"),
     *("pass", "constraintPlus", "kineticPlus", "speedPlus", "candidate", "rounding", "applies", "scale"),
-    *("lost", "skipped", "moved", "total", "solverTolerance"),
+    *("lost", "skipped", "moved", "total", "prescribed", "solverTolerance"),
 }
-"""Variables of the run that no later step depends on, or that the program does not change."""
+"""Variables of the run that no later step depends on."""
 
 
 def make_program(settings: Settings) -> Program:
     """The program of an integrator with these settings."""
     program = Program(per_dof=["start", "startVelocity", "force", "velocity", "end"])
     program.variables = settings.globals() | _RUN | {"step": settings.nominal}
-    kept = [name for name in _RUN if name not in _OF_ONE_STEP]
     for k, monitor in enumerate(settings.monitors):
         program.variables[f"reference{k}"] = monitor.reference
-        kept.append(f"reference{k}")
         # U at the start, its change over the half steps around it, and U at the next step: for the start of the
         # density.
         program.variables |= {f"mean{k}": 0.0, f"half{k}": 0.0, f"next{k}": 0.0}
+    step = Program()
+    _begin(step, settings)
+    if settings.is_iterative:
+        _solve(step, settings)
+    else:
+        _step_explicitly(step, settings)
+    _finish(step, settings)
+    references = [f"reference{k}" for k in range(len(settings.monitors))]
+    kept = [name for name in [*_RUN, *references] if name not in _OF_ONE_STEP and step.changes(name)]
     program.variables |= {KEPT + name: 0.0 for name in kept}
     _notice_changes(program)
     with program.block("$lost > 0"):
         program.compute("$skipped", "$skipped + 1")
     with program.block("$lost <= 0"):
         _keep(program, kept)
-        _begin(program, settings)
-        if settings.is_iterative:
-            _solve(program, settings)
-        else:
-            _step_explicitly(program, settings)
-        _finish(program, settings)
+        program.steps += step.steps
     return program
 
 
@@ -487,8 +495,9 @@ def _finish(program: Program, settings: Settings) -> None:
     program.per_particle("$end", "x")
     _position_sums(program, settings, "$force")
     if settings.is_iterative:
-        compute("$kineticMinus", "$kineticPlus")
-        compute("$speedMinus", "$speedPlus")
+        if settings.uses_velocities:
+            compute("$kineticMinus", "$kineticPlus")
+            compute("$speedMinus", "$speedPlus")
     else:
         _velocity_sums(program, settings)
     with program.block("$fresh > 0"):
