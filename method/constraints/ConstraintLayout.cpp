@@ -376,6 +376,7 @@ void ConstraintSystem::append(const Given& given, const vector<int>& members) {
 // Give every expression its entries of a Jacobian and put it into the group of its like.
 void ConstraintSystem::groupExpressions(const Given& given) {
     placeInGroups.resize(expressions.size());
+    firstParameters.resize(expressions.size());
     typedef std::tuple<std::string, size_t, vector<std::string>> Kind;
     std::map<Kind, int> groupOf;
     vector<int> groupSizes;
@@ -397,7 +398,9 @@ void ConstraintSystem::groupExpressions(const Given& given) {
             groups.emplace_back(new ExpressionGroup(c));
             groupSizes.push_back(0);
         }
-        groups[group]->add(c, k, firstEntry, inverseMasses);
+        groups[group]->add(c, k, firstEntry, numParameters, inverseMasses);
+        firstParameters[e] = numParameters;
+        numParameters += (int) c.parameters.size();
         placeInGroups[e] = {group, groupSizes[group]++};
     }
 }

@@ -30,10 +30,53 @@ std::string listParticles(const vector<int>& particles) {
 
 } // namespace
 
-void ConstraintSystem::setParameters(int expression, const std::map<std::string, double>& parameters) {
-    expressions[expression].parameters = parameters;
-    const std::pair<int, int>& place = placeInGroups[expression];
-    groups[place.first]->setParameters(place.second, parameters);
+ExpressionParameters ConstraintSystem::getGivenParameters() const {
+    ExpressionParameters theta;
+    theta.values.resize(numParameters);
+    theta.rates.resize(numParameters);
+    for (size_t e = 0; e < expressions.size(); e++)
+        writeParameters((int) e, expressions[e].parameters, theta.values);
+    return theta;
+}
+
+void ConstraintSystem::writeParameters(int expression, const std::map<std::string, double>& parameters,
+                                       vector<double>& values) const {
+    int place = firstParameters[expression];
+    for (const auto& parameter : parameters) // in the order of their names
+        values[place++] = parameter.second;
+}
+
+ExpressionConstraint ConstraintSystem::getExpression(int index, const ExpressionParameters& theta) const {
+    const int e = givenIndex[index] - numGivenDistances;
+    ExpressionConstraint result = expressions[e];
+    int place = firstParameters[e];
+    for (auto& parameter : result.parameters)
+        parameter.second = theta.values[place++];
+    return result;
+}
+
+void ConstraintSystem::findParameterChange(const vector<Vec3>& q, const ExpressionParameters& theta,
+                                           const vector<double>& target, vector<double>& change) const {
+    for (int i = 0; i < numParameters; i++)
+        change[i] = target[i] - theta.values[i];
+    ExpressionParameters there = theta, along = theta;
+    there.values = target;
+    along.rates = change;
+    along.isMoving = true;
+    vector<double> before(getNumConstraints()), after(getNumConstraints()), linear(getNumConstraints());
+    forGroups(ALL, [&](ExpressionGroup& group, int first, int end) {
+        group.evaluate(q, theta, before, first, end);
+        group.evaluate(q, there, after, first, end);
+        group.addParameterMotion(q, along, linear, first, end);
+    });
+    for (const ExpressionRow& row : expressionRows) {
+        const double ratio = (after[row.constraint] - before[row.constraint]) / linear[row.constraint];
+        if (!(ratio < 0.5)) // which no curvature of g makes of a small change
+            continue;
+        const int e = givenIndex[row.constraint] - numGivenDistances, first = firstParameters[e];
+        for (size_t i = 0; i < expressions[e].parameters.size(); i++)
+            change[first + i] *= ratio;
+    }
 }
 
 std::string ConstraintSystem::describe(int index) const {
@@ -71,7 +114,8 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
 std::string ConstraintSystem::explainResolution(int index, const vector<Vec3>& q, double tolerance) const {
     const DistanceConstraint& c = constraints[index];
     double largest = 0;
-    for (int i : isExpression(index) ? getExpression(index).particles : vector<int>{c.particle1, c.particle2})
+    for (int i : isExpression(index) ? expressions[givenIndex[index] - numGivenDistances].particles
+                                     : vector<int>{c.particle1, c.particle2})
         for (int axis = 0; axis < 3; axis++)
             largest = std::max(largest, std::fabs(q[i][axis]));
     const double spacing = std::numeric_limits<double>::epsilon() * largest;
@@ -161,8 +205,8 @@ const ConstraintSystem::ExpressionRow& ConstraintSystem::findRow(int constraint)
                              [](const ExpressionRow& row, int k) { return row.constraint < k; });
 }
 
-double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, const Jacobian& nearby,
-                                  const Part& part) const {
+double ConstraintSystem::evaluate(const vector<Vec3>& q, const ExpressionParameters& theta, vector<double>& g,
+                                  const Jacobian& nearby, const Part& part) const {
     double largest = 0;
     auto keepLargest = [&](double size) {
         if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
@@ -174,7 +218,7 @@ double ConstraintSystem::evaluate(const vector<Vec3>& q, vector<double>& g, cons
         g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
         keepLargest(std::fabs(g[k]));
     });
-    forGroups(part, [&](ExpressionGroup& group, int first, int end) { group.evaluate(q, g, first, end); });
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) { group.evaluate(q, theta, g, first, end); });
     forRows(part, [&](const ExpressionRow& row) { keepLargest(findErrorOf(row, g, nearby)); });
     return largest;
 }
@@ -190,9 +234,12 @@ int ConstraintSystem::findLargest(const vector<double>& g, const Jacobian& nearb
     return largest;
 }
 
-int ConstraintSystem::findSingular(const vector<Vec3>& q, const vector<Vec3>& displacement, const Jacobian& jacobian,
+int ConstraintSystem::findSingular(const vector<Vec3>& q, const ExpressionParameters& theta,
+                                   const vector<Vec3>& displacement, const Jacobian& jacobian,
                                    Jacobian& velocityJacobian) const {
-    evaluateVelocityJacobian(q, displacement, velocityJacobian);
+    ExpressionParameters atRest = theta;
+    atRest.isMoving = false;
+    evaluateVelocityJacobian(q, displacement, atRest, velocityJacobian);
     int singular = NONE;
     double largest = STRONG_CURVATURE;
     for (const ExpressionRow& row : expressionRows) {
@@ -234,17 +281,28 @@ void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jac
     });
 }
 
-void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, Jacobian& jacobian, const Part& part) const {
+void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, const ExpressionParameters& theta, Jacobian& jacobian,
+                                        const Part& part) const {
     evaluateDistanceRows(q, jacobian, part);
-    forGroups(part,
-              [&](ExpressionGroup& group, int first, int end) { group.evaluateJacobian(q, jacobian, first, end); });
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+        group.evaluateJacobian(q, theta, jacobian, first, end);
+    });
 }
 
-void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, Jacobian& jacobian,
+void ConstraintSystem::addParameterMotion(const vector<Vec3>& q, const ExpressionParameters& theta,
+                                          vector<double>& result, const Part& part) const {
+    if (theta.isMoving)
+        forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+            group.addParameterMotion(q, theta, result, first, end);
+        });
+}
+
+void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v,
+                                                const ExpressionParameters& theta, Jacobian& jacobian,
                                                 const Part& part) const {
     evaluateDistanceRows(v, jacobian, part);
     forGroups(part, [&](ExpressionGroup& group, int first, int end) {
-        group.evaluateVelocityJacobian(q, v, jacobian, first, end);
+        group.evaluateVelocityJacobian(q, v, theta, jacobian, first, end);
     });
 }
 
@@ -307,14 +365,16 @@ void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vec
     }
 }
 
-void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result,
+void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v,
+                                         const ExpressionParameters& theta, vector<double>& result,
                                          const Part& part) const {
     forDistances(part, [&](int k) {
         Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
         result[k] = w.dot(w) * inverseSquareLengths[k];
     });
-    forGroups(part,
-              [&](ExpressionGroup& group, int first, int end) { group.evaluateCurvature(q, v, result, first, end); });
+    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+        group.evaluateCurvature(q, v, theta, result, first, end);
+    });
 }
 
 void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, vector<double>& result) const {

@@ -146,10 +146,8 @@ public:
     const DistanceConstraint& getConstraint(int index) const {
         return constraints[index];
     }
-    /** A constraint that is given as an expression, with its parameters. */
-    const ExpressionConstraint& getExpression(int index) const {
-        return expressions[givenIndex[index] - numGivenDistances];
-    }
+    /** A constraint that is given as an expression, with values of its parameters. */
+    ExpressionConstraint getExpression(int index, const ExpressionParameters& theta) const;
     const std::vector<ExpressionRow>& getExpressionRows() const {
         return expressionRows;
     }
@@ -161,8 +159,26 @@ public:
     int getConstraintOf(int entry) const {
         return entry < getNumConstraints() ? entry : expressionEntries[entry - getNumConstraints()].constraint;
     }
-    /** Change the parameters of an expression, counted in the order of the constructor. */
-    void setParameters(int expression, const std::map<std::string, double>& parameters);
+    /** The number of parameters of all expressions. */
+    int getNumParameters() const {
+        return numParameters;
+    }
+    /** The parameters that the constructor was given, at rest. */
+    ExpressionParameters getGivenParameters() const;
+    /** Write the parameters of an expression, counted in the order of the constructor, into the values of all. */
+    void writeParameters(int expression, const std::map<std::string, double>& parameters,
+                         std::vector<double>& values) const;
+    /**
+     * The way from parameters theta to others, such that following it changes g as going there does: the difference, but for a
+     * parameter that stands for an angle and has been set back by a full turn that is what is left of it.
+     *
+     * @param q                positions that satisfy the constraints for theta
+     * @param theta            the parameters there
+     * @param target           the values to come
+     * @param[out] change      the way to them
+     */
+    void findParameterChange(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                             const std::vector<double>& target, std::vector<double>& change) const;
     /** A constraint in words, for messages. */
     std::string describe(int index) const;
     const std::vector<Cluster>& getClusters() const {
@@ -217,13 +233,13 @@ public:
     std::vector<int> getClusterParticles(int cluster) const;
 
     /**
-     * g(q) in g.
+     * g(q) in g, for parameters theta of the expressions.
      *
      * @param nearby    the Jacobian at q or nearby, which gives the errors of expressions their length
      * @return the largest relative error of a constraint, or a NaN
      */
-    double evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, const Jacobian& nearby,
-                    const Part& part = ALL) const;
+    double evaluate(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta, std::vector<double>& g,
+                    const Jacobian& nearby, const Part& part = ALL) const;
     /** How far the particles are from where an expression holds, to first order, in units of EXPRESSION_LENGTH. */
     double findErrorOf(const ExpressionRow& row, const std::vector<double>& g, const Jacobian& nearby) const;
     /** The index of the constraint with the largest relative error. */
@@ -234,21 +250,28 @@ public:
      * expression's particles.
      *
      * @param q                   positions
+     * @param theta               the parameters of the expressions
      * @param displacement        the motion from there (nm)
      * @param jacobian            G(q)
      * @param velocityJacobian    work space
      * @return the constraint, or NONE
      */
-    int findSingular(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& displacement,
-                     const Jacobian& jacobian, Jacobian& velocityJacobian) const;
+    int findSingular(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                     const std::vector<OpenMM::Vec3>& displacement, const Jacobian& jacobian,
+                     Jacobian& velocityJacobian) const;
     /** G(q), the Jacobian. */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, Jacobian& jacobian, const Part& part = ALL) const;
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta, Jacobian& jacobian,
+                          const Part& part = ALL) const;
+    /** result += dg/dtheta . dtheta/dt, the change of the constraints in time at fixed q. */
+    void addParameterMotion(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                            std::vector<double>& result, const Part& part = ALL) const;
     /**
      * G(v), the matrix whose rows are (d^2g/dq^2 v)^T at q: half the derivative of g''(v,v) with respect to v. For distance
-     * constraints it is the Jacobian with v in place of q, since they are quadratic (paper, Lemma 4.1).
+     * constraints it is the Jacobian with v in place of q, since they are quadratic (paper, Lemma 4.1). Where parameters move, it is
+     * the derivative of G along both motions.
      */
     void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                                  Jacobian& jacobian, const Part& part = ALL) const;
+                                  const ExpressionParameters& theta, Jacobian& jacobian, const Part& part = ALL) const;
     /** G w. */
     void multiply(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& w, std::vector<double>& result,
                   const Part& part = ALL) const;
@@ -260,9 +283,10 @@ public:
     /** result += scale M^-1 G^T x; for a piece, what all constraints do to its particles. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
                                std::vector<OpenMM::Vec3>& result, const Part& part = ALL) const;
-    /** g''(v,v), the second derivative of the constraints along v at q. */
+    /** g''(v,v), the second derivative of the constraints along v at q, and along the motion of the parameters. */
     void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                           std::vector<double>& result, const Part& part = ALL) const;
+                           const ExpressionParameters& theta, std::vector<double>& result,
+                           const Part& part = ALL) const;
     /**
      * The factor that turns a multiplier of constraint index into that of the constraint as users see it: |r|^2 - L^2
      * (kJ/mol/nm^2) for a distance, and the expression itself (kJ/mol over the unit of g), whose factor is 1.
@@ -346,6 +370,8 @@ private:
     std::vector<ExpressionConstraint> expressions; // in the order of the constructor
     std::vector<std::unique_ptr<ExpressionGroup>> groups;
     std::vector<std::pair<int, int>> placeInGroups; // group and number therein of each expression
+    std::vector<int> firstParameters;               // of each expression in ExpressionParameters
+    int numParameters = 0;
     std::vector<GroupRange> groupRanges; // first each group as a whole, then those of the parts
     std::vector<ExpressionRow> expressionRows; // in internal order, and their entries too
     std::vector<ExpressionEntry> expressionEntries;

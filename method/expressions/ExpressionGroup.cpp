@@ -16,36 +16,37 @@ ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParti
     const char* const axes[] = {"x", "y", "z"};
     for (int i = 0; i < 3 * numParticles; i++)
         coordinates.push_back(graph.addVariable(axes[i % 3] + std::to_string(i / 3 + 1)));
-    for (const auto& parameter : example.parameters) {
-        parameterNames.push_back(parameter.first);
+    for (const auto& parameter : example.parameters)
         parameters.push_back(graph.addVariable(parameter.first));
-    }
     // Not optimized by Lepton, which for a constant that is not a number would go on for ever; the graph does it.
     value = graph.addExpression(Lepton::Parser::parse(example.expression).getRootNode());
     // These names can not be written in an expression.
-    vector<std::pair<int, int>> rates;
+    vector<std::pair<int, int>> motions[2], motionOfParameters;
     for (int i = 0; i < 3 * numParticles; i++) {
         velocities.push_back(graph.addVariable("velocity " + std::to_string(i)));
-        rates.emplace_back(coordinates[i], velocities[i]);
+        motions[0].emplace_back(coordinates[i], velocities[i]);
     }
-    rate = graph.differentiate(value, rates);
-    curvature = graph.differentiate(rate, rates);
+    for (size_t i = 0; i < parameters.size(); i++) {
+        parameterRates.push_back(graph.addVariable("rate " + std::to_string(i)));
+        motionOfParameters.emplace_back(parameters[i], parameterRates[i]);
+    }
+    motions[1] = motions[0];
+    motions[1].insert(motions[1].end(), motionOfParameters.begin(), motionOfParameters.end());
+    for (int i = 0; i < 2; i++) {
+        rate[i] = graph.differentiate(value, motions[i]);
+        curvature[i] = graph.differentiate(rate[i], motions[i]);
+    }
+    parameterMotion = graph.differentiate(value, motionOfParameters);
 }
 
-void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int firstEntry,
+void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int firstEntry, int firstParameter,
                           const vector<double>& inverseMasses) {
     indices.push_back(index);
+    firstParameters.push_back(firstParameter);
     for (int i : constraint.particles) {
         particles.push_back(i);
         entries.push_back(inverseMasses[i] > 0 ? firstEntry++ : NO_ENTRY);
     }
-    parameterValues.resize(parameterValues.size() + parameters.size());
-    setParameters(getNumConstraints() - 1, constraint.parameters);
-}
-
-void ExpressionGroup::setParameters(int n, const std::map<string, double>& newParameters) {
-    for (size_t i = 0; i < parameterNames.size(); i++)
-        parameterValues[n * parameterNames.size() + i] = newParameters.at(parameterNames[i]);
 }
 
 // A program, made when it is first needed, which may be by several threads at once.
@@ -55,6 +56,7 @@ const ArrayExpression& ExpressionGroup::require(Program& program, const std::fun
         vector<int> inputs = coordinates;
         inputs.insert(inputs.end(), velocities.begin(), velocities.end());
         inputs.insert(inputs.end(), parameters.begin(), parameters.end());
+        inputs.insert(inputs.end(), parameterRates.begin(), parameterRates.end());
         const vector<int> outputs = findOutputs();
         program.reset(new ArrayExpression(graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
     }
@@ -103,22 +105,26 @@ void ExpressionGroup::run(const ArrayExpression& program, const Range& range, co
                     x[2][n] = velocity[2];
                 }
         }
-        for (int i = 0; i < numParameters; i++)
+        for (int i = 0; i < 2 * numParameters; i++)
             if (program.usesInput(2 * numCoordinates + i)) {
+                const vector<double>& numbers = i < numParameters ? range.theta.values : range.theta.rates;
                 double* input = program.getInput(work, 2 * numCoordinates + i);
                 for (int n = 0; n < count; n++)
-                    input[n] = parameterValues[(size_t) (first + n) * numParameters + i];
+                    input[n] = numbers[firstParameters[first + n] + i % numParameters];
             }
         program.evaluate(work, count);
         store(work, first, count);
     }
 }
 
-void ExpressionGroup::runValues(const ArrayExpression& program, const Range& range, vector<double>& result) const {
+void ExpressionGroup::runValues(const ArrayExpression& program, const Range& range, vector<double>& result,
+                                bool mustAdd) const {
     run(program, range, [&](const double* work, int first, int count) {
         const double* output = program.getOutput(work, 0);
-        for (int n = 0; n < count; n++)
-            result[indices[first + n]] = output[n];
+        for (int n = 0; n < count; n++) {
+            double& x = result[indices[first + n]];
+            x = mustAdd ? x + output[n] : output[n];
+        }
     });
 }
 
@@ -136,22 +142,32 @@ void ExpressionGroup::runRows(const ArrayExpression& program, const Range& range
     });
 }
 
-void ExpressionGroup::evaluate(const vector<Vec3>& q, vector<double>& g, int first, int end) {
-    runValues(require(valueProgram, [&] { return vector<int>{value}; }), {q, nullptr, first, end}, g);
+void ExpressionGroup::evaluate(const vector<Vec3>& q, const ExpressionParameters& theta, vector<double>& g, int first,
+                               int end) {
+    runValues(require(valueProgram, [&] { return vector<int>{value}; }), {q, nullptr, theta, first, end}, g, false);
 }
 
-void ExpressionGroup::evaluateJacobian(const vector<Vec3>& q, vector<Vec3>& jacobian, int first, int end) {
-    runRows(require(jacobianProgram, [&] { return graph.findGradient(value, coordinates); }), {q, nullptr, first, end},
-            jacobian);
+void ExpressionGroup::evaluateJacobian(const vector<Vec3>& q, const ExpressionParameters& theta, vector<Vec3>& jacobian,
+                                       int first, int end) {
+    runRows(require(jacobianProgram, [&] { return graph.findGradient(value, coordinates); }),
+            {q, nullptr, theta, first, end}, jacobian);
 }
 
-void ExpressionGroup::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, vector<double>& result, int first,
-                                        int end) {
-    runValues(require(curvatureProgram, [&] { return vector<int>{curvature}; }), {q, &v, first, end}, result);
+void ExpressionGroup::addParameterMotion(const vector<Vec3>& q, const ExpressionParameters& theta,
+                                         vector<double>& result, int first, int end) {
+    runValues(require(motionProgram, [&] { return vector<int>{parameterMotion}; }), {q, nullptr, theta, first, end},
+              result, true);
 }
 
-void ExpressionGroup::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v, vector<Vec3>& jacobian,
-                                               int first, int end) {
-    runRows(require(velocityJacobianProgram, [&] { return graph.findGradient(rate, coordinates); }),
-            {q, &v, first, end}, jacobian);
+void ExpressionGroup::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, const ExpressionParameters& theta,
+                                        vector<double>& result, int first, int end) {
+    auto findOutputs = [&] { return vector<int>{curvature[theta.isMoving]}; };
+    runValues(require(curvaturePrograms[theta.isMoving], findOutputs), {q, &v, theta, first, end}, result, false);
+}
+
+void ExpressionGroup::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v,
+                                               const ExpressionParameters& theta, vector<Vec3>& jacobian, int first,
+                                               int end) {
+    auto findOutputs = [&] { return graph.findGradient(rate[theta.isMoving], coordinates); };
+    runRows(require(velocityJacobianPrograms[theta.isMoving], findOutputs), {q, &v, theta, first, end}, jacobian);
 }

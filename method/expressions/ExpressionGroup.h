@@ -23,6 +23,16 @@ struct ExpressionConstraint {
 };
 
 /**
+ * The parameters theta of all expressions of a system, in the order that ConstraintSystem gives them, and their rates of change
+ * in time. A parameter that changes is a coordinate whose motion is prescribed: it has a part in the derivatives of g along the
+ * motion.
+ */
+struct ExpressionParameters {
+    std::vector<double> values, rates;
+    bool isMoving = false; // whether a rate is not zero
+};
+
+/**
  * The constraints that share an expression, a number of particles and the names of their parameters. The expression is parsed
  * and differentiated once, and evaluated for those that were added as the first-th, ..., (end - 1)-th together. Several threads may
  * evaluate different ones at the same time.
@@ -39,26 +49,31 @@ public:
      * @param constraint        the constraint
      * @param index             its place in arrays of constraints
      * @param firstEntry        the place of its first entry in a Jacobian
+     * @param firstParameter    the place of its first parameter in ExpressionParameters; they are in the order of their names
      * @param inverseMasses     1/mass of every particle of the system; 0 for one that does not move
      */
-    void add(const ExpressionConstraint& constraint, int index, int firstEntry,
+    void add(const ExpressionConstraint& constraint, int index, int firstEntry, int firstParameter,
              const std::vector<double>& inverseMasses);
     int getNumConstraints() const {
         return (int) indices.size();
     }
-    /** Change the parameters of the constraint that was added as the n-th. */
-    void setParameters(int n, const std::map<std::string, double>& parameters);
 
     /** g(q) */
-    void evaluate(const std::vector<OpenMM::Vec3>& q, std::vector<double>& g, int first, int end);
+    void evaluate(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta, std::vector<double>& g,
+                  int first, int end);
     /** The rows of G(q) = dg/dq. */
-    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, std::vector<OpenMM::Vec3>& jacobian, int first, int end);
-    /** g''(v,v) at q. */
+    void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                          std::vector<OpenMM::Vec3>& jacobian, int first, int end);
+    /** result += dg/dtheta . rates, the change of g in time at fixed q. */
+    void addParameterMotion(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                            std::vector<double>& result, int first, int end);
+    /** g''(v,v) at q, the second derivative of g along the motion of the particles and of the parameters. */
     void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                           std::vector<double>& result, int first, int end);
-    /** The rows (d^2g/dq^2 v)^T at q. */
+                           const ExpressionParameters& theta, std::vector<double>& result, int first, int end);
+    /** The rows (d^2g/dq^2 v)^T at q, the derivative of G along the motion of the particles and of the parameters. */
     void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                                  std::vector<OpenMM::Vec3>& jacobian, int first, int end);
+                                  const ExpressionParameters& theta, std::vector<OpenMM::Vec3>& jacobian, int first,
+                                  int end);
 
 private:
     /**
@@ -67,25 +82,27 @@ private:
      */
     static constexpr int MAX_BLOCK_SIZE = 64, NO_ENTRY = -1;
     typedef std::unique_ptr<ArrayExpression> Program;
-    /** What a program works on: positions, perhaps velocities, and the constraints first, ..., end - 1. */
+    /** What a program works on: positions, perhaps velocities, parameters, and the constraints first, ..., end - 1. */
     struct Range {
         const std::vector<OpenMM::Vec3>& q;
         const std::vector<OpenMM::Vec3>* v;
+        const ExpressionParameters& theta;
         int first, end;
     };
     const ArrayExpression& require(Program& program, const std::function<std::vector<int>()>& findOutputs);
     template <class Store> void run(const ArrayExpression& program, const Range& range, const Store& store) const;
-    void runValues(const ArrayExpression& program, const Range& range, std::vector<double>& result) const;
+    void runValues(const ArrayExpression& program, const Range& range, std::vector<double>& result, bool mustAdd) const;
     void runRows(const ArrayExpression& program, const Range& range, std::vector<OpenMM::Vec3>& jacobian) const;
     int numParticles;
     ExpressionGraph graph;
-    std::vector<int> coordinates, velocities,
-        parameters; // variables of the graph, in this order the inputs of all programs
-    std::vector<std::string> parameterNames;
-    int value, rate, curvature; // nodes: g, its derivative along v, and the derivative of this along v
-    Program valueProgram, jacobianProgram, curvatureProgram, velocityJacobianProgram; // made when they are first needed
-    std::vector<int> indices, particles, entries; // NO_ENTRY for a particle without mass
-    std::vector<double> parameterValues;
+    std::vector<int> coordinates, velocities, parameters,
+        parameterRates; // variables of the graph, in this order the inputs of all programs
+    // Nodes: g, its derivative along the motion of the parameters alone, the one along v, and the derivative of this along v.
+    // Of two, the second is along the motion of the parameters too.
+    int value, parameterMotion, rate[2], curvature[2];
+    // Made when they are first needed, as of nodes.
+    Program valueProgram, jacobianProgram, motionProgram, curvaturePrograms[2], velocityJacobianPrograms[2];
+    std::vector<int> indices, firstParameters, particles, entries; // NO_ENTRY for a particle without mass
     std::mutex mutex; // of the making of programs
 };
 

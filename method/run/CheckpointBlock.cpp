@@ -16,7 +16,7 @@ using std::string;
 namespace {
 
 const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
-const int VERSION = 2; // 2: fingerprints of box and parameters, no force groups
+const int VERSION = 3; // 2: fingerprints of box and parameters, no force groups; 3: parameters of expressions
 const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
 
 unsigned long long fingerprintOf(const string& data) {

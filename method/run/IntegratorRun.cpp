@@ -55,7 +55,8 @@ private:
 IntegratorRun::IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles,
                              unsigned long long system) :
         device(device), settings(settings), applied(settings), numParticles(numParticles), system(system),
-        areSettingsChanged(true), isAtStart(false), task(Task::Start) {
+        areSettingsChanged(true), isAtStart(false), areParametersNew(false), areForcesChanged(false),
+        task(Task::Start) {
     if (canTakeSettings())
         takeSettings();
 }
@@ -75,6 +76,10 @@ void IntegratorRun::stateChanged() {
     // OpenMM announces what it has loaded as a change of the user's; whether it is one, the fingerprint will tell.
     if (saved == nullptr)
         task = Task::Start;
+}
+
+void IntegratorRun::forcesChanged() {
+    areForcesChanged = areForcesChanged || saved == nullptr;
 }
 
 void IntegratorRun::requireStepSize() const {
@@ -108,9 +113,9 @@ void IntegratorRun::takeSettings() {
     const bool isSameGroup =
         settings.usesMonitorForceGroup() == applied.usesMonitorForceGroup() &&
         (!settings.usesMonitorForceGroup() || settings.monitorForceGroup == applied.monitorForceGroup);
-    if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups() ||
-        !settings.hasSameParameters(applied))
+    if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups())
         task = Task::Start;
+    areParametersNew = areParametersNew || !settings.hasSameParameters(applied);
     // A start has met the tolerance that there was.
     if (isAtStart && settings.constraintTolerance != applied.constraintTolerance)
         task = Task::Start;
@@ -123,8 +128,11 @@ void IntegratorRun::takeSaved() {
     if (saved == nullptr)
         return;
     try {
-        const bool goesOn = saved->context == device.getFingerprint() && device.resume(*saved, applied);
+        areForcesChanged = saved->areForcesOutdated || saved->parameters != device.getParameterFingerprint();
+        const bool goesOn =
+            saved->context == device.getFingerprint() && device.resume(*saved, applied, areForcesChanged);
         task = goesOn ? Task::None : Task::Start;
+        isAtStart = isAtStart && !goesOn;
     }
     catch (const StepFailure& failure) {
         throwFailure("going on from a saved run", device.getTime(), failure.what(), "");
@@ -133,9 +141,13 @@ void IntegratorRun::takeSaved() {
 }
 
 // Bring the method's state in line with the Context, which may have been changed in between.
-void IntegratorRun::prepare(bool areForcesInvalid) {
+void IntegratorRun::prepare(bool areForcesInvalid, bool isForStep) {
     takeSaved();
     takeSettings();
+    // Constraints with new parameters are met by the next step, which moves them there. Whoever asks for numbers before the first
+    // step asks for those of a run that starts where they hold.
+    if (isAtStart && areParametersNew && !isForStep)
+        task = Task::Start;
     try {
         const RunDevice::Change change = device.findChange();
         if (areForcesInvalid || change == RunDevice::Change::State) // a barostat, say
@@ -148,10 +160,17 @@ void IntegratorRun::prepare(bool areForcesInvalid) {
             device.start();
         else if (task == Task::ChangeState)
             device.changeState();
-        else if (task == Task::ChangeVelocities)
-            device.changeVelocities();
+        else {
+            if (task == Task::ChangeVelocities)
+                device.changeVelocities();
+            task = Task::None;
+            if (areForcesChanged)
+                device.changeForces();
+        }
         isAtStart = isAtStart || task == Task::Start;
+        areParametersNew = areParametersNew && task != Task::Start;
         task = Task::None;
+        areForcesChanged = false;
     }
     catch (const StepFailure& failure) {
         throwFailure("the start", device.getTime(), failure.what(), "");
@@ -163,10 +182,10 @@ void IntegratorRun::prepare(bool areForcesInvalid) {
 // A step, which the device may not have taken when this returns.
 void IntegratorRun::askForStep(double maxTime) {
     takeSaved(); // as long as no Force has changed the Context
-    prepare(device.updateState());
+    prepare(device.updateState(), true);
     startAutomatic();
     device.step(maxTime);
-    isAtStart = false;
+    isAtStart = areParametersNew = false;
     toldSize.reset();
     toldDensity.reset();
 }
@@ -403,6 +422,8 @@ RunState IntegratorRun::save() {
         run.startsAfresh = task != Task::None;
     }
     run.context = device.getFingerprint();
+    run.parameters = device.getParameterFingerprint();
+    run.areForcesOutdated = areForcesChanged;
     run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
     run.lastDensity = getStepDensity();
     run.references = getReferences();
@@ -422,6 +443,7 @@ void IntegratorRun::requireUsable(const RunState& run, const IntegratorSettings&
 void IntegratorRun::resume(const RunState& run) {
     saved.reset();
     task = Task::Start;
+    areForcesChanged = false;
     settingsChanged();
     toldSize = run.lastStepSize;
     toldDensity = run.lastDensity;

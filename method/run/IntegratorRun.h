@@ -33,6 +33,8 @@ public:
     void nominalStepChanged();
     /** Take note that the user has changed the Context: unless it is in the state of a saved run, the next step starts afresh. */
     void stateChanged();
+    /** Take note that parameters of Forces have changed: the next step goes on with their forces, which cost one more evaluation. */
+    void forcesChanged();
 
     void step(int count);
     void stepTo(double time);
@@ -78,7 +80,7 @@ private:
     bool canTakeSettings() const;
     void takeSettings();
     void takeSaved();
-    void prepare(bool areForcesInvalid);
+    void prepare(bool areForcesInvalid, bool isForStep = false);
     std::vector<double> getReferences();
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);
@@ -92,7 +94,9 @@ private:
     const int numParticles;
     const unsigned long long system;
     bool areSettingsChanged;
-    bool isAtStart; // no step has been taken since the last start
+    bool isAtStart;        // no step has been taken since the last start
+    bool areParametersNew; // those of expressions, since the last step or start
+    bool areForcesChanged; // since the last step; of no interest where the task computes them anyway
     Task task;
     std::unique_ptr<RunState> saved; // to go on from, until it is known whether the Context is in its state
     /** What there was before automatic step control started, as long as no step has been taken since. */

@@ -40,7 +40,7 @@ public:
      * Take over settings, which are consistent (IntegratorSettings::isConsistent()) and have the constraints that the device was
      * made with. Called before anything is asked that depends on them, and again between steps when they have changed. In the
      * course of a run the density goes on where the new settings allow it: it is scaled with u = U/U_ref. The values of the
-     * parameters of expressions are compared with those in force.
+     * parameters of expressions are those that the next step leads to; start() puts them in force at once.
      *
      * @throws StepFailure    if the System cannot have one of the monitors
      */
@@ -73,10 +73,12 @@ public:
      */
     virtual Change findChange() = 0;
     /**
-     * A number made from the Context's positions, velocities, box and parameters, by which a saved run knows again the state that it
-     * belongs to; without what is no part of a State that somebody may load. It does not change by reading it.
+     * A number made from the Context's positions, velocities and box, by which a saved run knows again the state that it belongs
+     * to; without what is no part of a State that somebody may load. It does not change by reading it.
      */
     virtual unsigned long long getFingerprint() = 0;
+    /** The same of the Context's parameters, with which forces change. */
+    virtual unsigned long long getParameterFingerprint() = 0;
 
     /**
      * Start afresh from the Context's state: positions and velocities are moved onto the constraints, the forces computed there,
@@ -90,6 +92,11 @@ public:
     virtual void changeState() = 0;
     /** Go on with changed velocities at the same positions, without computing forces; the density goes on, scaled with u. */
     virtual void changeVelocities() = 0;
+    /**
+     * Go on with the forces computed anew, since parameters of Forces have changed, at the method's positions and velocities; the
+     * density goes on, scaled with u.
+     */
+    virtual void changeForces() = 0;
 
     /** Give the Context the velocities of the method's state, at whose positions they satisfy the constraints. */
     virtual void writeVelocities() = 0;
@@ -188,9 +195,10 @@ public:
      * computed, to compare them with the saved ones, for a Force may have been changed since; if they are the same but for
      * rounding they take their place.
      *
+     * @param areForcesOthers    the forces are known to be others and changeForces() will follow: go on without computing any
      * @return whether it goes on; if not, nothing has been taken over
      */
-    virtual bool resume(const RunState& run, const IntegratorSettings& saved) = 0;
+    virtual bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) = 0;
 };
 
 } // namespace OpenMMVRattle

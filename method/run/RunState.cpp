@@ -98,6 +98,8 @@ unsigned long long RunState::fingerprintOf(const OpenMM::System& system, const I
 void RunState::write(std::ostream& stream) const {
     writeValue(stream, system);
     writeValue(stream, context);
+    writeValue(stream, parameters);
+    writeValue(stream, areForcesOutdated);
     writeValue(stream, lastStepSize);
     writeValue(stream, lastDensity);
     writeArray(stream, references);
@@ -123,6 +125,8 @@ void RunState::write(std::ostream& stream) const {
 void RunState::read(std::istream& stream) {
     readValue(stream, system);
     readValue(stream, context);
+    readValue(stream, parameters);
+    readValue(stream, areForcesOutdated);
     readValue(stream, lastStepSize);
     readValue(stream, lastDensity);
     readArray(stream, references);
@@ -149,6 +153,7 @@ void RunState::read(std::istream& stream) {
 
 void RunState::write(SerializationNode& node) const {
     node.setLongProperty("system", (long long) system).setLongProperty("context", (long long) context);
+    node.setLongProperty("parameters", (long long) parameters).setBoolProperty("areForcesOutdated", areForcesOutdated);
     node.setDoubleProperty("lastStepSize", lastStepSize).setDoubleProperty("lastDensity", lastDensity);
     writeArray(node, "References", references);
     node.setBoolProperty("startsAfresh", startsAfresh);
@@ -171,6 +176,8 @@ void RunState::write(SerializationNode& node) const {
 void RunState::read(const SerializationNode& node) {
     system = (unsigned long long) node.getLongProperty("system");
     context = (unsigned long long) node.getLongProperty("context");
+    parameters = (unsigned long long) node.getLongProperty("parameters");
+    areForcesOutdated = node.getBoolProperty("areForcesOutdated");
     lastStepSize = node.getDoubleProperty("lastStepSize");
     lastDensity = node.getDoubleProperty("lastDensity");
     readArray(node, "References", references);

@@ -42,6 +42,8 @@ struct RunState {
 
     unsigned long long system = 0;     // fingerprint of the System
     unsigned long long context = 0;    // fingerprint of the Context: RunDevice::getFingerprint()
+    unsigned long long parameters = 0; // and of its parameters
+    bool areForcesOutdated = false;    // the forces are those before the parameters of a Force were changed
     double lastStepSize = 0;           // ps; 0 before the first step
     double lastDensity = 1;            // rho of the last step
     std::vector<double> references;    // U_k,ref in force, 0 if not known

@@ -125,8 +125,8 @@ void requireWholeExpressions(const ConstraintSystem& system, const StartState& s
         return;
     vector<double> g(system.getNumConstraints());
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(state.positions, jacobian);
-    system.evaluate(state.positions, g, jacobian);
+    system.evaluateJacobian(state.positions, state.parameters, jacobian);
+    system.evaluate(state.positions, state.parameters, g, jacobian);
     vector<double> masses;
     vector<ExpressionConstraint> copies;
     vector<Vec3> positions;
@@ -134,7 +134,7 @@ void requireWholeExpressions(const ConstraintSystem& system, const StartState& s
     for (const ConstraintSystem::ExpressionRow& row : system.getExpressionRows()) {
         if (system.findErrorOf(row, g, jacobian) <= MET_FRACTION)
             continue;
-        ExpressionConstraint copy = system.getExpression(row.constraint);
+        ExpressionConstraint copy = system.getExpression(row.constraint, state.parameters);
         const vector<int> particles = copy.particles;
         for (const vector<Vec3>& placement : findPlacements(particles, state)) {
             std::iota(copy.particles.begin(), copy.particles.end(), (int) masses.size());
@@ -150,8 +150,9 @@ void requireWholeExpressions(const ConstraintSystem& system, const StartState& s
     const ConstraintSystem images(masses, {}, copies);
     g.resize(images.getNumConstraints());
     jacobian.resize(images.getNumEntries());
-    images.evaluateJacobian(positions, jacobian);
-    images.evaluate(positions, g, jacobian);
+    const ExpressionParameters parameters = images.getGivenParameters();
+    images.evaluateJacobian(positions, parameters, jacobian);
+    images.evaluate(positions, parameters, g, jacobian);
     for (const ConstraintSystem::ExpressionRow& row : images.getExpressionRows())
         if (images.findErrorOf(row, g, jacobian) <= MET_FRACTION)
             throw StepFailure(system.describe(originals[images.getParticleOf(row.first)]) +

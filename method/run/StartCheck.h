@@ -17,6 +17,8 @@ struct StartState {
     const std::vector<char>& isVirtualSite;
     /** The three vectors of the periodic box in OpenMM's reduced form, or none if there is no such box. */
     const OpenMM::Vec3* boxVectors;
+    /** Of the expressions. */
+    const ExpressionParameters& parameters;
 };
 
 /**

@@ -64,7 +64,7 @@ void VRattleDynamics::ensureFactor(FactorScope scope) {
     Part part = ConstraintSystem::ALL;
     if (scope == GeneralFactor)
         part.first = system.getFirstGeneral();
-    system.evaluateJacobian(q, jacobian, part);
+    system.evaluateJacobian(q, theta, jacobian, part);
     const int failed = matrix.tryToFactorize(jacobian, part);
     if (failed != ConstraintMatrix::REGULAR)
         matrix.throwDependent(failed, jacobian);
@@ -81,9 +81,9 @@ void VRattleDynamics::projectVelocities(vector<Vec3>& velocities) {
 }
 
 // u(q,p) with Lambda = K^-1 (g''(v,v) + G M^-1 F)   (4.3)
-double VRattleDynamics::evaluateU(const vector<Vec3>& velocities) {
+double VRattleDynamics::evaluateU(const vector<Vec3>& velocities, const ExpressionParameters& parameters) {
     ensureFactor(FullFactor);
-    system.evaluateCurvature(q, velocities, rightSideTrial);
+    system.evaluateCurvature(q, velocities, parameters, rightSideTrial);
     for (size_t k = 0; k < rightSideTrial.size(); k++)
         rightSideTrial[k] += appliedTerm[k];
     multiplierTrial = rightSideTrial;
@@ -93,10 +93,10 @@ double VRattleDynamics::evaluateU(const vector<Vec3>& velocities) {
 }
 
 // The on-step quantities at a position: (3.12)-(3.13) from the half-step velocities, then Lambda and the monitors.
-void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector<Vec3>& halfStep,
-                                     const vector<Vec3>& forces, double energy, double kick, vector<Vec3>& velocities,
-                                     vector<double>& multipliers, vector<double>& rightSides,
-                                     vector<double>& monitorValues, bool withHalfStep) {
+void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const ExpressionParameters& parameters,
+                                     const vector<Vec3>& halfStep, const vector<Vec3>& forces, double energy,
+                                     double kick, vector<Vec3>& velocities, vector<double>& multipliers,
+                                     vector<double>& rightSides, vector<double>& monitorValues, bool withHalfStep) {
     factorScope = NoFactor;
     isMonitorCurrent = false;
     const OnStepArrays arrays = {positions.data(),
@@ -109,10 +109,12 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
                                  rightSideHalf.data(),
                                  lambdaRate.data(),
                                  kick};
-    const OnStep state = {positions, halfStep, forces, velocities, multipliers, rightSides, kick, withHalfStep};
+    const OnStep state = {positions,   halfStep,   forces, parameters,  velocities,
+                          multipliers, rightSides, kick,   withHalfStep};
     const vector<double>& inverseMasses = system.getInverseMasses();
     work.runOnJoints([&](const CutCluster& cluster) {
-        system.evaluateJacobian(positions, jacobianNext, cluster.joints); // their rows are in the columns of pieces
+        system.evaluateJacobian(positions, parameters, jacobianNext,
+                                cluster.joints); // their rows are in the columns of pieces
     });
     Result result =
         work.run([&](int block) { monitor.sumForces(forces, block); },
@@ -128,7 +130,7 @@ void VRattleDynamics::evaluateOnStep(const vector<Vec3>& positions, const vector
         matrix.throwDependent(result.failed, jacobianNext);
     if (!(result.pivot > ConstraintMatrix::MIN_RELATIVE_PIVOT)) {
         // The general way knows how to name the cluster.
-        system.evaluateJacobian(positions, jacobianNext);
+        system.evaluateJacobian(positions, parameters, jacobianNext);
         matrix.factorize(jacobianNext);
     }
     monitor.finishForces(forces, energy);
@@ -161,6 +163,7 @@ int VRattleDynamics::evaluateOnStepPieces(const OnStep& state) {
     work.runOnJoints([&](const CutCluster& cluster) {
         failed = std::max(failed, matrix.tryToFactorizeJoints(jacobianNext, cluster));
         system.multiply(jacobianNext, state.velocities, correction, cluster.joints);
+        system.addParameterMotion(state.positions, state.parameters, correction, cluster.joints);
         matrix.solveJoints(correction, cluster);
     });
     if (failed != ConstraintMatrix::REGULAR)
@@ -191,7 +194,7 @@ int VRattleDynamics::evaluateOnStepPieces(const OnStep& state) {
 
 // Kick the velocities of a part, and begin to solve for their projection.
 int VRattleDynamics::beginVelocities(const OnStep& state, const Part& part) {
-    system.evaluateJacobian(state.positions, jacobianNext, part);
+    system.evaluateJacobian(state.positions, state.parameters, jacobianNext, part);
     const int failed = matrix.tryToFactorize(jacobianNext, part);
     if (failed != ConstraintMatrix::REGULAR)
         return failed;
@@ -202,6 +205,7 @@ int VRattleDynamics::beginVelocities(const OnStep& state, const Part& part) {
         state.velocities[i] = state.halfStep[i] + state.forces[i] * (state.kick * inverseMasses[i]);
     }
     system.multiply(jacobianNext, state.velocities, correction, part);
+    system.addParameterMotion(state.positions, state.parameters, correction, part);
     matrix.eliminate(correction, part);
     return ConstraintMatrix::REGULAR;
 }
@@ -220,7 +224,7 @@ void VRattleDynamics::beginMultipliers(const OnStep& state, const Part& part) {
 void VRattleDynamics::formMultiplierEquations(const OnStep& state, const Part& part) {
     system.multiplyOverMass(jacobianNext, state.forces, appliedTermNext, part);
     auto form = [&](const vector<Vec3>& velocities, vector<double>& rightSides, vector<double>& multipliers) {
-        system.evaluateCurvature(state.positions, velocities, rightSides, part);
+        system.evaluateCurvature(state.positions, velocities, state.parameters, rightSides, part);
         for (int k = part.first; k < part.end; k++)
             multipliers[k] = rightSides[k] += appliedTermNext[k];
     };
@@ -241,7 +245,7 @@ void VRattleDynamics::beginRates(const OnStep& state, const Part& part) {
 }
 
 void VRattleDynamics::formRateEquations(const OnStep& state, const Part& part) {
-    system.evaluateVelocityJacobian(state.positions, state.velocities, velocityJacobian, part);
+    system.evaluateVelocityJacobian(state.positions, state.velocities, state.parameters, velocityJacobian, part);
     system.multiply(velocityJacobian, acceleration, lambdaRate, part);
     for (int k = part.first; k < part.end; k++)
         lambdaRate[k] *= 2;
@@ -253,7 +257,7 @@ double VRattleDynamics::evaluateRate() {
         const vector<double>& inverseMasses = system.getInverseMasses();
         for (int i : movingParticles)
             acceleration[i] = monitor.getForces()[i] * inverseMasses[i];
-        system.evaluateJacobian(qNext, velocityJacobian);
+        system.evaluateJacobian(qNext, thetaNext, velocityJacobian);
         system.addTransposedOverMass(velocityJacobian, lambdaOnStep, -1.0, acceleration);
     }
     return density.limitDerivative(monitor.combine(valuesNext)) *
@@ -263,14 +267,15 @@ double VRattleDynamics::evaluateRate() {
 bool VRattleDynamics::projectPositions(vector<Vec3>& positions) {
     if (system.getNumConstraints() == 0)
         return false;
+    areParametersChanging = false;
     factorScope = NoFactor;
-    system.evaluateJacobian(positions, jacobian);
-    if (system.evaluate(positions, residual, jacobian) <= settings.tolerance)
+    system.evaluateJacobian(positions, theta, jacobian);
+    if (system.evaluate(positions, theta, residual, jacobian) <= settings.tolerance)
         return false;
     if (!projectByChord(positions) && !projectByNewton(positions)) {
         for (int i : movingParticles)
             acceleration[i] = qNext[i] - positions[i];
-        system.evaluateJacobian(positions, jacobian);
+        system.evaluateJacobian(positions, theta, jacobian);
         throw StepFailure(explainNotConverged(
             positions, acceleration,
             "; set positions that are nearer to where the constraints hold, if there are such: constraints that "
@@ -286,7 +291,7 @@ bool VRattleDynamics::projectByChord(const vector<Vec3>& positions) {
     qNext = positions;
     double previous = std::numeric_limits<double>::infinity();
     while (true) {
-        lastError = system.evaluate(qNext, residual, jacobian);
+        lastError = system.evaluate(qNext, theta, residual, jacobian);
         const bool isSlow = !(lastError <= SLOW_CONVERGENCE * previous);
         if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN))
             return true;
@@ -304,8 +309,8 @@ bool VRattleDynamics::projectByNewton(const vector<Vec3>& positions) {
     qNext = positions;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
-        system.evaluateJacobian(qNext, jacobian);
-        lastError = system.evaluate(qNext, residual, jacobian);
+        system.evaluateJacobian(qNext, theta, jacobian);
+        lastError = system.evaluate(qNext, theta, residual, jacobian);
         const bool isSlow = !(lastError <= SLOW_CONVERGENCE * previous);
         if (lastError <= settings.tolerance * (isSlow ? 1.0 : ON_STEP_MARGIN))
             return true;
@@ -318,7 +323,7 @@ bool VRattleDynamics::projectByNewton(const vector<Vec3>& positions) {
         const bool isFound = takeDampedUpdate(lastError, [&](double part) {
             wNext = qNext;
             system.addTransposedOverMass(jacobian, correction, -part, wNext);
-            return system.evaluate(wNext, residual, jacobian);
+            return system.evaluate(wNext, theta, residual, jacobian);
         });
         // Where the error is no more than the tolerance, rounding may keep it from becoming less.
         if (!isFound && lastError > settings.tolerance)
@@ -343,7 +348,7 @@ void VRattleDynamics::startMultipliers(bool withOffset) {
 }
 
 void VRattleDynamics::keepOffsets() {
-    densityOffset = rhoNext - StepDensity::sumUpdate(u, rho);
+    densityOffset = rhoNext - densityScale * StepDensity::sumUpdate(u, rho);
     for (size_t k = 0; k < lambdaNext.size(); k++)
         multiplierOffset[k] = lambdaNext[k] - lambda[k];
 }
@@ -427,7 +432,7 @@ double VRattleDynamics::solveGeneral(const Part& part, const Trial& trial, doubl
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0;; iteration++) {
         computeTrial(trial, part, iteration > 0); // there is at least one update
-        const double error = system.evaluate(qNext, correction, jacobian, part);
+        const double error = system.evaluate(qNext, thetaNext, correction, jacobian, part);
         if (isLastIteration(iteration, error, previous, tolerance)) {
             iterations = std::max(iterations, iteration);
             return error;
@@ -447,7 +452,7 @@ void VRattleDynamics::updateMultipliers(const Trial& trial, int first, int end) 
 // returns the largest |g|.
 double VRattleDynamics::evaluatePiece(const Part& piece, const Trial& trial, double tolerance, bool isFirst) {
     computeTrial(trial, piece, !isFirst);
-    const double error = system.evaluate(qNext, correction, jacobian, piece);
+    const double error = system.evaluate(qNext, thetaNext, correction, jacobian, piece);
     isPieceEliminated[piece.piece] = isFirst || error > tolerance;
     if (isPieceEliminated[piece.piece])
         matrix.eliminate(correction, piece);
@@ -459,7 +464,7 @@ double VRattleDynamics::solvePieces(const Trial& trial, double error, double tol
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0;; iteration++) {
         work.runOnJoints([&](const CutCluster& cluster) {
-            error = SharedWork::larger(error, system.evaluate(qNext, correction, jacobian, cluster.joints));
+            error = SharedWork::larger(error, system.evaluate(qNext, thetaNext, correction, jacobian, cluster.joints));
         });
         if (isLastIteration(iteration, error, previous, tolerance)) {
             iterations = std::max(iterations, iteration);
@@ -499,10 +504,10 @@ bool VRattleDynamics::iterateNewton(const Trial& trial) {
         for (size_t k = 0; k < lambdaNext.size(); k++)
             lambdaNext[k] = response[k] + part * correction[k] / (trial.kick * trial.drift);
         computeTrial(trial);
-        return system.evaluate(qNext, residual, jacobian);
+        return system.evaluate(qNext, thetaNext, residual, jacobian);
     };
     computeTrial(trial);
-    lastError = system.evaluate(qNext, residual, jacobian);
+    lastError = system.evaluate(qNext, thetaNext, residual, jacobian);
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS && std::isfinite(lastError); iteration++) {
         const bool isSlow = lastError > SLOW_CONVERGENCE * previous;
@@ -511,7 +516,7 @@ bool VRattleDynamics::iterateNewton(const Trial& trial) {
         previous = lastError;
         correction = residual;
         response = lambdaNext; // where the update starts
-        system.evaluateJacobian(qNext, jacobianNext);
+        system.evaluateJacobian(qNext, thetaNext, jacobianNext);
         if (!newtonMatrix.factorize(jacobianNext, jacobian))
             return false;
         newtonMatrix.solve(correction);
@@ -532,12 +537,12 @@ bool VRattleDynamics::iterateNewton(const Trial& trial) {
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     const double h = settings.stepSize;
     if (!hasHalfStepValue) {
-        halfStepValue = evaluateU(w);
+        halfStepValue = evaluateU(w, theta);
         hasHalfStepValue = true;
     }
     if (system.getFirstGeneral() < system.getNumConstraints())
         ensureFactor(GeneralFactor);
-    rhoNext = StepDensity::sumUpdate(u, rho) + densityOffset;
+    rhoNext = densityScale * StepDensity::sumUpdate(u, rho) + densityOffset;
     if (!(rhoNext > 0))
         return TooSlow;
     startMultipliers(true);
@@ -546,6 +551,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     const double densityTolerance = std::max(REGULAR_MARGIN * settings.tolerance, DENSITY_ROUNDING);
     for (int pass = 0; pass <= MAX_CHORD_ITERATIONS; pass++) {
         const Trial trial = {w, 0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext};
+        setRates(thetaHalf, trial.drift);
         const StepArrays arrays = stepArrays(trial);
         work.runOnJoints([&](const CutCluster& cluster) { // before the pieces, whose particles the joints pull at
             for (int k = cluster.joints.first; k < cluster.joints.end; k++)
@@ -561,7 +567,7 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
                      [&](const Part& piece, Result& share) { share.addError(beginCoupledPass(piece, trial)); });
         lastError = SharedWork::larger(result.error, finishCoupledPassOfPieces(trial));
         monitor.evaluate(wNext, multiplierTrial, rightSideTrial, valuesTrial);
-        const double mismatch = rhoNext + rho - combineAndLimit(valuesTrial) - halfStepValue;
+        const double mismatch = rhoNext - combineAndLimit(valuesTrial) + densityScale * (rho - halfStepValue);
         const double error = std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
                                       std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
         if (pass > 0 && error <= 1)
@@ -597,8 +603,8 @@ double VRattleDynamics::beginCoupledPass(const Part& part, const Trial& trial) {
 }
 
 double VRattleDynamics::formCoupledEquations(const Part& part, const Trial& trial) {
-    const double error = system.evaluate(qNext, correction, jacobian, part);
-    system.evaluateCurvature(q, wNext, rightSideTrial, part);
+    const double error = system.evaluate(qNext, thetaNext, correction, jacobian, part);
+    system.evaluateCurvature(q, wNext, thetaHalf, rightSideTrial, part);
     for (int k = part.first; k < part.end; k++) {
         multiplierTrial[k] = rightSideTrial[k] += appliedTerm[k];
         correction[k] /= trial.kick * trial.drift;
@@ -626,19 +632,21 @@ double VRattleDynamics::finishCoupledPassOfPieces(const Trial& trial) {
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     ensureFactor(FullFactor);
     const double h = settings.stepSize;
-    const double uMinus = evaluateU(w);
+    const double uMinus = densityScale * evaluateU(w, theta);
     startMultipliers(true);
-    rhoNext = StepDensity::sumUpdate(u, rho);
+    rhoNext = densityScale * StepDensity::sumUpdate(u, rho);
     if (!(rhoNext > 0))
-        rhoNext = density.boundedUpdate(u, rho);
+        rhoNext = density.boundedUpdate(densityScale * u, densityScale * rho);
     int numCuts = 0;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
         const double kick = 0.5 * h * (1 / rho + 1 / rhoNext), drift = h / rhoNext;
         computeTrial({w, kick, drift});
-        lastError = system.evaluate(qNext, residual, jacobian);
-        const double uPlus = evaluateU(wNext);
-        const double mismatch = rhoNext + rho - uPlus - uMinus; // F_rho of docs/method.md, section 8
+        setRates(thetaHalf, drift);
+        lastError = system.evaluate(qNext, thetaNext, residual, jacobian);
+        const double uPlus = evaluateU(wNext, thetaHalf);
+        // F_rho of docs/method.md, section 8
+        const double mismatch = rhoNext - uPlus + densityScale * rho - uMinus;
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error =
             std::max(lastError / (REGULAR_MARGIN * settings.tolerance),
@@ -650,11 +658,11 @@ VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
         if (iteration > 0 && (error <= 1 || (isSlow && isGoodEnough)))
             return Converged;
         previous = error;
-        system.evaluateJacobian(qNext, jacobianNext);
+        system.evaluateJacobian(qNext, thetaNext, jacobianNext);
         if (!newtonMatrix.factorize(jacobianNext, jacobian))
             return NotConverged;
         // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-        monitor.evaluateGradient(q, wNext, multiplierTrial, valuesTrial, matrix, gradient);
+        monitor.evaluateGradient(q, thetaHalf, wNext, multiplierTrial, valuesTrial, matrix, gradient);
         const double derivative = density.limitDerivative(monitor.combine(valuesTrial));
         system.multiplyOverMass(jacobian, gradient, coupling);
         for (double& a : coupling)
@@ -699,15 +707,16 @@ double VRattleDynamics::solveRegular() {
     };
     auto solveWith = [&](double next) { return solvePositions(trialWith(next), false); };
     const bool isFixed = settings.isFixedStep || monitor.isEmpty();
+    const double bounded = density.boundedUpdate(densityScale * u, densityScale * rho);
     bool isSolved;
     if (isFixed)
         isSolved = solveWith(settings.isAutomatic && !settings.isFixedStep ? automatic.getNext() : 1);
     else if (settings.update == StepDensity::Bounded)
-        isSolved = solveWith(density.boundedUpdate(u, rho));
+        isSolved = solveWith(bounded);
     else if (needsHalfStepValue())
         isSolved = solveCoupled() == Converged || solveCoupledByNewton() == Converged;
     else {
-        const double next = StepDensity::sumUpdate(u, rho);
+        const double next = densityScale * StepDensity::sumUpdate(u, rho);
         isSolved = next > 0 && solveWith(next);
     }
     if (isFixed || settings.update == StepDensity::Bounded) {
@@ -716,7 +725,7 @@ double VRattleDynamics::solveRegular() {
     }
     else if (!isSolved || density.isFarBelowBound(rhoNext)) {
         // A rescue: the sum gave no step, or one far above the maximum.
-        if (!solveWith(density.boundedUpdate(u, rho)))
+        if (!solveWith(bounded))
             throwNotConverged(trialWith(rhoNext));
         numRescues++;
         isRescued = true;
@@ -729,6 +738,8 @@ void VRattleDynamics::throwNotConverged(const Trial& trial) {
         acceleration[i] = trial.start[i] * trial.drift;
     std::stringstream reason;
     reason << explainNotConverged(q, acceleration, "");
+    if (areParametersChanging)
+        reason << "; parameters of constraints have been changed for this step, so move them by less at a time";
     if (hasDensity && settings.isAutomatic)
         reason << "; the step tried was of " << settings.stepSize / rhoNext << " ps";
     else if (hasDensity && !monitor.isEmpty())
@@ -743,7 +754,7 @@ std::string VRattleDynamics::explainNotConverged(const vector<Vec3>& from, const
     std::stringstream reason;
     // What keeps an iteration from converging need not be what has the largest error in the end.
     const int worst = system.findLargest(residual, jacobian);
-    const int singular = system.findSingular(from, displacement, jacobian, velocityJacobian);
+    const int singular = system.findSingular(from, theta, displacement, jacobian, velocityJacobian);
     const std::string unresolved = system.explainResolution(worst, from, settings.tolerance);
     if (singular != ConstraintSystem::NONE)
         reason << system.describe(singular)

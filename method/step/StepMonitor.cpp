@@ -346,9 +346,9 @@ double StepMonitor::combine(const vector<double>& values) const {
     return std::sqrt(sum / sumOfWeights);
 }
 
-void StepMonitor::evaluateGradient(const vector<Vec3>& q, const vector<Vec3>& v, const vector<double>& multipliers,
-                                   const vector<double>& values, const ConstraintMatrix& matrix,
-                                   vector<Vec3>& gradient) {
+void StepMonitor::evaluateGradient(const vector<Vec3>& q, const ExpressionParameters& theta, const vector<Vec3>& v,
+                                   const vector<double>& multipliers, const vector<double>& values,
+                                   const ConstraintMatrix& matrix, vector<Vec3>& gradient) {
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     std::fill(gradient.begin(), gradient.end(), Vec3());
@@ -414,7 +414,7 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& q, const vector<Vec3>& v,
             solved[k] += toSolve[k];
     }
     // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-    system.evaluateVelocityJacobian(q, v, velocityJacobian);
+    system.evaluateVelocityJacobian(q, v, theta, velocityJacobian);
     for (double& x : solved)
         x *= 2;
     system.addTransposed(velocityJacobian, solved, gradient);

@@ -127,15 +127,17 @@ public:
      * du/dv at the state of the last evaluate().
      *
      * @param q              the positions
+     * @param theta          the parameters of the expressions
      * @param v              as in evaluate()
      * @param multipliers    as in evaluate()
      * @param values         what evaluate() gave
      * @param matrix         the factorised K(q)
      * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
      */
-    void evaluateGradient(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                          const std::vector<double>& multipliers, const std::vector<double>& values,
-                          const ConstraintMatrix& matrix, std::vector<OpenMM::Vec3>& gradient);
+    void evaluateGradient(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
+                          const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
+                          const std::vector<double>& values, const ConstraintMatrix& matrix,
+                          std::vector<OpenMM::Vec3>& gradient);
 
 private:
     double squareOf(const OpenMM::Vec3& force, int particle) const;

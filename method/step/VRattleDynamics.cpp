@@ -17,6 +17,9 @@ namespace {
 const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
+// A relative change of u, or of the velocities, that starts no oscillation to speak of: the density is not scaled for it, which would
+// cost reversibility.
+const double SMALL_JUMP = 0.01;
 
 } // namespace
 
@@ -26,7 +29,8 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
         automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
         hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false),
         factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
-        isRescued(false), numIterations(0), numRescues(0), lastError(0) {
+        areParametersChanging(false), densityScale(1), isJump(false), isRescued(false), numIterations(0), numRescues(0),
+        lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -39,6 +43,8 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
           &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction,
           &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
+    theta = thetaNext = thetaHalf = thetaBack = system.getGivenParameters();
+    target = parameterChange = theta.values;
     isPieceEliminated.resize(system.getPieces().size());
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(system.getNumEntries());
@@ -146,9 +152,23 @@ void VRattleDynamics::requireConstraintsFor(const vector<StepMonitor::Term>& ter
 
 // ------------------------------------------------------------------------------------------- between two steps
 
+void VRattleDynamics::adoptParameters() {
+    theta.values = target;
+    areParametersChanging = false;
+    factorScope = NoFactor;
+}
+
 void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                             double energy) {
     const Kept before = keep();
+    target = theta.values;
+    std::fill(theta.rates.begin(), theta.rates.end(), 0.0);
+    theta.isMoving = false;
+    beginAt(positions, velocities, forces, energy, before);
+}
+
+void VRattleDynamics::beginAt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                              double energy, const Kept& before) {
     q = positions;
     v = velocities;
     force = forces;
@@ -160,7 +180,7 @@ void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& v
     densityOffset = 0;
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
     try {
-        evaluateOnStep(q, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+        evaluateOnStep(q, theta, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
     }
     catch (...) {
         putBack(before);
@@ -183,6 +203,8 @@ VRattleDynamics::Memory VRattleDynamics::getMemory() const {
     Memory memory = {hasDensity,
                      rho,
                      w,
+                     theta.values,
+                     theta.rates,
                      multiplierOffset,
                      {},
                      lambda,
@@ -209,7 +231,7 @@ vector<double> VRattleDynamics::getReferences() const {
 }
 
 VRattleDynamics::Kept VRattleDynamics::keep() const {
-    return {settings, q, v, force, groupEnergy, getMemory(), rightSide};
+    return {settings, q, v, force, groupEnergy, target, getMemory(), rightSide};
 }
 
 void VRattleDynamics::putBack(const Kept& kept) {
@@ -220,6 +242,7 @@ void VRattleDynamics::putBack(const Kept& kept) {
     v = kept.velocities;
     force = kept.forces;
     groupEnergy = kept.groupEnergy;
+    target = kept.target;
     rightSide = kept.rightSide;
     setMemory(kept.memory);
     factorScope = NoFactor;
@@ -227,6 +250,9 @@ void VRattleDynamics::putBack(const Kept& kept) {
 }
 
 void VRattleDynamics::setMemory(const Memory& memory) {
+    theta.values = memory.parameters;
+    theta.rates = memory.parameterRates;
+    theta.isMoving = std::any_of(theta.rates.begin(), theta.rates.end(), [](double rate) { return rate != 0; });
     lambda = memory.multipliers;
     values = memory.monitorValues;
     setReferences(memory.references);
@@ -246,8 +272,10 @@ void VRattleDynamics::setMemory(const Memory& memory) {
 
 void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                              double energy, const Memory& memory) {
-    begin(positions, velocities, forces, energy);
-    v = velocities; // begin() has projected them, which changes the last bits
+    const Kept before = keep();
+    setMemory(memory); // with the parameters
+    beginAt(positions, velocities, forces, energy, before);
+    v = velocities; // this has projected them, which changes the last bits
     setMemory(memory);
 }
 
@@ -256,7 +284,7 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
     const bool hadDensity = hasDensity;
     const double oldRho = rho, oldU = u;
     const AutomaticControl::Memory oldControl = automatic.getMemory();
-    begin(positions, velocities, forces, energy);
+    beginAt(positions, velocities, forces, energy, keep());
     if (!hadDensity)
         return;
     hasDensity = true;
@@ -307,15 +335,60 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
         speedSquared += system.getMasses()[i] * v[i].dot(v[i]);
         w[i] += change[i];
     }
-    evaluateU(v);
-    lambda = multiplierTrial;
-    rightSide = rightSideTrial;
-    values = valuesTrial;
-    hasHalfStepValue = false;
+    evaluateU(v, theta);
+    takeTrialValues();
     rescaleDensity(u);
     // The density of the last step stays, for its kick is in w.
     if (settings.isAutomatic)
         automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
+}
+
+void VRattleDynamics::changeForces(vector<Vec3>& forces, double energy) {
+    double changeSquared = 0, forceSquared = 1e-100; // in the mass metric
+    for (int i : movingParticles) {
+        const Vec3 change = forces[i] - force[i];
+        changeSquared += system.getInverseMasses()[i] * change.dot(change);
+        forceSquared += system.getInverseMasses()[i] * std::max(forces[i].dot(forces[i]), force[i].dot(force[i]));
+    }
+    if (!std::isfinite(changeSquared))
+        throw StepFailure("the force on a particle is infinite or not a number");
+    auto exchange = [&] {
+        force.swap(forces);
+        std::swap(groupEnergy, energy);
+        factorScope = NoFactor;
+        isMonitorCurrent = false;
+    };
+    exchange();
+    try {
+        evaluateU(v, theta);
+        monitor.requireValid(valuesTrial);
+    }
+    catch (const StepFailure&) {
+        exchange();
+        throw;
+    }
+    takeTrialValues();
+    if (!hasDensity) {
+        forgetDensity();
+        if (settings.isAutomatic)
+            automatic.begin(v, force, lambda, rightSide);
+        return;
+    }
+    rescaleDensity(u);
+    if (settings.isAutomatic) {
+        automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / forceSquared)));
+        rho = automatic.getLast();
+    }
+    if (hasDensity)
+        formHalfStepVelocities();
+}
+
+// What evaluateU() has found at (q[n],p[n]) is Lambda and U_k there.
+void VRattleDynamics::takeTrialValues() {
+    lambda = multiplierTrial;
+    rightSide = rightSideTrial;
+    values = valuesTrial;
+    hasHalfStepValue = false;
 }
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
@@ -335,6 +408,8 @@ double VRattleDynamics::step(double maxStep) {
     work.beginStep();
     isRescued = false;
     ensureFactor(NoFactor); // of a step before that has failed, the monitor may have the forces still
+    prepareParameters();
+    findJump();
     double full;
     if (hasDensity) {
         stepKind = Regular;
@@ -361,10 +436,72 @@ double VRattleDynamics::step(double maxStep) {
         if (!solvePositions(trial, true))
             throwNotConverged(trial);
     }
+    setRates(thetaNext, stepNext);
     if (isShortened && hasDensity) // where the density would be at the end of the shortened step
         rhoNext = rho + (rhoNext - rho) * std::min(1.0, stepNext / full);
     kickNext = 0.5 * stepNext;
     return stepNext;
+}
+
+// theta[n+1] and the way to it.
+void VRattleDynamics::prepareParameters() {
+    densityScale = 1;
+    isJump = false;
+    areParametersChanging = target != theta.values;
+    thetaNext.values = target;
+    thetaHalf.values = theta.values;
+    if (areParametersChanging)
+        system.findParameterChange(q, theta, target, parameterChange);
+    else
+        std::fill(parameterChange.begin(), parameterChange.end(), 0.0);
+}
+
+// The rates of parameters that move in a step of that size.
+void VRattleDynamics::setRates(ExpressionParameters& parameters, double size) const {
+    parameters.isMoving = areParametersChanging;
+    for (size_t k = 0; k < parameterChange.size(); k++)
+        parameters.rates[k] = parameterChange[k] / size;
+}
+
+/*
+ * Where parameters begin to move, or stop, the velocities along the constraints jump in the step that comes, and u with them. As
+ * after any other jump of the state the density keeps its ratio to u: in the next update u[n], rho[n-1/2] and u(q[n],p[n-1/2]) are
+ * all scaled with what u becomes with the new velocities; the densities of automatic step control start from their monitors at the
+ * end of the step. Where rates change little by little u follows, and nothing is done.
+ */
+void VRattleDynamics::findJump() {
+    const bool isVariable = hasDensity && !settings.isFixedStep && (settings.isAutomatic || !monitor.isEmpty());
+    if (!isVariable || !(areParametersChanging || theta.isMoving))
+        return;
+    setRates(thetaHalf, settings.stepSize / rho);
+    bool isSudden = false;
+    for (size_t k = 0; k < parameterChange.size(); k++) {
+        const double before = theta.rates[k];
+        double& rate = thetaHalf.rates[k];
+        if (std::fabs(rate - before) > 0.5 * std::max(std::fabs(rate), std::fabs(before)))
+            isSudden = true;
+        else
+            rate = before;
+    }
+    if (!isSudden)
+        return;
+    ensureFactor(FullFactor);
+    system.multiply(jacobian, v, correction);
+    system.addParameterMotion(q, thetaHalf, correction);
+    matrix.solve(correction);
+    double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
+    for (int i : movingParticles)
+        vNext[i] = Vec3();
+    system.addTransposedOverMass(jacobian, correction, -1.0, vNext);
+    for (int i : movingParticles) {
+        changeSquared += system.getMasses()[i] * vNext[i].dot(vNext[i]);
+        vNext[i] += v[i];
+        speedSquared += system.getMasses()[i] * std::max(vNext[i].dot(vNext[i]), v[i].dot(v[i]));
+    }
+    isJump = changeSquared > SMALL_JUMP * SMALL_JUMP * speedSquared;
+    const double scale = evaluateU(vNext, thetaHalf) / u;
+    if (std::isfinite(scale) && scale > 0 && std::fabs(scale - 1) > SMALL_JUMP)
+        densityScale = scale;
 }
 
 bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
@@ -376,7 +513,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
         startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
     }
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
-    evaluateOnStep(qNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
+    evaluateOnStep(qNext, thetaNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
                    withHalfStep);
     if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
@@ -399,6 +536,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     }
 
     q.swap(qNext);
+    std::swap(theta, thetaNext);
     v.swap(vNext);
     w.swap(wNext);
     force.swap(forces);
@@ -420,6 +558,8 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
         rho = rhoNext;
         u = combineAndLimit(values);
     }
+    if (settings.isAutomatic && hasDensity && isJump)
+        automatic.change(v, force, lambda, rightSide, 1.0);
     if (hasDensity && stepKind == Shortened)
         formHalfStepVelocities();
     return true;
@@ -448,7 +588,8 @@ void VRattleDynamics::reverse() {
     ensureFactor(NoFactor);
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
-        solveRegular();
+        prepareParameters();
+        const double size = solveRegular();
         keepOffsets();
         numRescues = rescuesBefore;
         for (int i : movingParticles)
@@ -456,10 +597,16 @@ void VRattleDynamics::reverse() {
         rho = rhoNext;
         automatic.reverse();
         rate = -rate;
-        hasHalfStepValue = false;
+        hasHalfStepValue = needsHalfStepValue();
+        if (hasHalfStepValue) { // it is of the step that would have come, and even in p and the rates
+            setRates(thetaHalf, size);
+            halfStepValue = evaluateU(w, thetaHalf);
+        }
     }
     for (int i : movingParticles)
         v[i] = -v[i];
+    for (double& each : theta.rates)
+        each = -each;
 }
 
 // ------------------------------------------------------------------------------------------------------- the start
@@ -507,11 +654,18 @@ double VRattleDynamics::findFirstDensity() {
 }
 
 bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energy, vector<double>& backValues) {
-    qNext.swap(qBack);
-    wNext.swap(wBack);
+    // Where the parameters are moving they come from where they would be at the same rate.
+    setRates(thetaBack, stepNext);
+    for (size_t k = 0; k < target.size(); k++)
+        thetaBack.values[k] = theta.values[k] - parameterChange[k];
+    auto swapBack = [&] {
+        qNext.swap(qBack);
+        wNext.swap(wBack);
+        std::swap(thetaNext, thetaBack);
+    };
+    swapBack();
     bool isSolved = solvePositions({v, -0.5 * stepNext, -stepNext}, true);
-    qNext.swap(qBack);
-    wNext.swap(wBack);
+    swapBack();
     if (!isSolved)
         return false;
     double product = 0, square = 0;
@@ -524,8 +678,8 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
     for (int i = 0; i < system.getNumParticles(); i++)
         forceBack[i] = force[i] + (forces[i] - force[i]) * alpha;
     try {
-        evaluateOnStep(qBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext, vBack,
-                       lambdaBack, rightSideBack, backValues, false);
+        evaluateOnStep(qBack, thetaBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext,
+                       vBack, lambdaBack, rightSideBack, backValues, false);
     }
     catch (const StepFailure&) {
         return false; // no state to look back at
@@ -535,9 +689,10 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
 
 // The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
 vector<double> VRattleDynamics::evaluateHalfSteps() {
-    evaluateU(wNext);
+    setRates(thetaHalf, stepNext);
+    evaluateU(wNext, thetaHalf);
     vector<double> result = valuesTrial;
-    evaluateU(wBack);
+    evaluateU(wBack, thetaHalf);
     for (size_t k = 0; k < result.size(); k++)
         result[k] = 0.5 * (result[k] + valuesTrial[k]);
     return result;

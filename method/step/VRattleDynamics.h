@@ -54,6 +54,8 @@ public:
         bool hasDensity;
         double density; // rho[n-1/2]
         std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
+        std::vector<double> parameters,
+            parameterRates; // theta[n] of the expressions, and dtheta/dt of the step to q[n]
         std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1], in internal order
         std::vector<double> references; // U_k,ref in force
         // What could be computed again but for the last bits, which decide whether a restart is exact:
@@ -85,14 +87,15 @@ public:
 
     /**
      * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
-     * those that do so to the tolerance are left as they are.
+     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
      *
      * @return whether the positions were changed
      * @throws StepFailure    if there is no such configuration nearby
      */
     bool projectPositions(std::vector<OpenMM::Vec3>& positions);
     /**
-     * Start afresh at a state. The velocities are projected onto the constraints.
+     * Start afresh at a state. The velocities are projected onto the constraints, whose parameters, those in force, are at rest
+     * and stay so until others are set.
      *
      * @throws StepFailure    if the multipliers or monitors are not defined there; then everything is as it was
      */
@@ -103,6 +106,7 @@ public:
         Settings settings;
         std::vector<OpenMM::Vec3> positions, velocities, forces;
         double groupEnergy;
+        std::vector<double> target;
         Memory memory;
         std::vector<double> rightSide;
     };
@@ -110,10 +114,20 @@ public:
     /** Put back what was kept, to the last bit. */
     void putBack(const Kept& kept);
     Memory getMemory() const;
-    /** Change the parameters of an expression, before the next begin(). */
+    /**
+     * Change the parameters of an expression: the next step leads to positions that satisfy the constraint with these, in that
+     * its position equation is g(q[n+1]; theta[n+1]) = 0 (3.11), and the velocities at its end
+     * G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
+     */
     void setParameters(int expression, const std::map<std::string, double>& parameters) {
-        system.setParameters(expression, parameters);
+        system.writeParameters(expression, parameters, target);
     }
+    /** theta[n], those in force, and the rates of the step that has led to them. */
+    const ExpressionParameters& getParameters() const {
+        return theta;
+    }
+    /** Put those that are set in force at once, before positions are projected and the run starts afresh with begin(). */
+    void adoptParameters();
     /**
      * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
      * following steps are the same to the last bit if the forces are.
@@ -135,6 +149,13 @@ public:
     bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
     /** Go on with changed velocities at the same positions; as changeState(). */
     void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
+    /**
+     * Go on with other forces at the same positions and velocities, since a parameter of a force has changed; as changeState().
+     *
+     * @param[in,out] forces    the applied forces; their storage is taken over, and that of the forces before left in its place
+     * @throws StepFailure    if they are not finite; then nothing has been changed
+     */
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
     /**
      * The first half of a step.
@@ -230,18 +251,27 @@ private:
     void rescaleDensity(double oldU);
     double combineAndLimit(const std::vector<double>& monitorValues) const;
     bool needsHalfStepValue() const;
+    void beginAt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                 const std::vector<OpenMM::Vec3>& forces, double energy, const Kept& before);
+    void takeTrialValues();
+
+    void prepareParameters();
+    void setRates(ExpressionParameters& parameters, double size) const;
+    void findJump();
 
     void ensureFactor(FactorScope scope);
     void formHalfStepVelocities();
-    double evaluateU(const std::vector<OpenMM::Vec3>& velocities);
+    double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& parameters);
     void projectVelocities(std::vector<OpenMM::Vec3>& velocities);
-    void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& halfStep,
-                        const std::vector<OpenMM::Vec3>& forces, double energy, double kick,
-                        std::vector<OpenMM::Vec3>& velocities, std::vector<double>& multipliers,
-                        std::vector<double>& rightSides, std::vector<double>& monitorValues, bool withHalfStep);
+    void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const ExpressionParameters& parameters,
+                        const std::vector<OpenMM::Vec3>& halfStep, const std::vector<OpenMM::Vec3>& forces,
+                        double energy, double kick, std::vector<OpenMM::Vec3>& velocities,
+                        std::vector<double>& multipliers, std::vector<double>& rightSides,
+                        std::vector<double>& monitorValues, bool withHalfStep);
     /** The on-step state that is computed, and what from. */
     struct OnStep {
         const std::vector<OpenMM::Vec3>&positions, &halfStep, &forces;
+        const ExpressionParameters& parameters;
         std::vector<OpenMM::Vec3>& velocities;
         std::vector<double>&multipliers, &rightSides;
         double kick;
@@ -310,6 +340,8 @@ private:
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
+    ExpressionParameters theta; // theta[n], with the rates of the step that has led to q[n]
+    std::vector<double> target; // theta[n+1], what the next step leads to
     double groupEnergy, rho, u;
     std::vector<double> lambda, rightSide, values; // Lambda, K Lambda and U_k
     std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1]
@@ -331,6 +363,12 @@ private:
     StepKind stepKind;
     std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
     double rhoNext, stepNext, kickNext;
+    std::vector<double> parameterChange; // theta[n+1] - theta[n]
+    bool areParametersChanging;
+    // theta[n+1], and theta[n] with the rates of this step, at which (3.14) takes u(q[n],p[n+1/2])
+    ExpressionParameters thetaNext, thetaHalf;
+    double densityScale; // by which u and rho change where the parameters begin to move, or stop
+    bool isJump; // whether that changes the velocities much
     std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext, appliedTermNext;
     std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
     std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
@@ -339,6 +377,7 @@ private:
 
     // Work space of the start.
     std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
+    ExpressionParameters thetaBack;
     std::vector<double> lambdaBack, rightSideBack;
 
     bool isRescued; // by the step in progress

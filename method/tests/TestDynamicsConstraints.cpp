@@ -98,21 +98,22 @@ static void assertSmall(double error, double tolerance) {
 void testJacobianIsDerivative() {
     Example e = makeExample(30);
     ConstraintSystem system(e.masses, e.constraints);
+    const ExpressionParameters theta = system.getGivenParameters();
     const int m = system.getNumConstraints();
     vector<double> plus(m), minus(m), derivative(m), curvature(m), zero(m);
     ConstraintSystem::Jacobian jacobian(m);
-    system.evaluateJacobian(e.positions, jacobian);
-    assertSmall(system.evaluate(e.positions, zero, jacobian), 1e-14);
+    system.evaluateJacobian(e.positions, theta, jacobian);
+    assertSmall(system.evaluate(e.positions, theta, zero, jacobian), 1e-14);
     const double h = 1e-4;
     vector<Vec3> ahead = e.positions, back = e.positions;
     for (size_t i = 0; i < ahead.size(); i++) {
         ahead[i] += e.velocities[i] * h;
         back[i] -= e.velocities[i] * h;
     }
-    system.evaluate(ahead, plus, jacobian);
-    system.evaluate(back, minus, jacobian);
+    system.evaluate(ahead, theta, plus, jacobian);
+    system.evaluate(back, theta, minus, jacobian);
     system.multiply(jacobian, e.velocities, derivative);
-    system.evaluateCurvature(e.positions, e.velocities, curvature);
+    system.evaluateCurvature(e.positions, e.velocities, theta, curvature);
     // A distance constraint is quadratic, so central differences are exact but for rounding.
     for (int k = 0; k < m; k++) {
         ASSERT_EQUAL_TOL((plus[k] - minus[k]) / (2 * h), derivative[k], 1e-8);
@@ -123,10 +124,11 @@ void testJacobianIsDerivative() {
 void testMatrixAgainstDense(int chainLength) {
     Example e = makeExample(chainLength);
     ConstraintSystem system(e.masses, e.constraints);
+    const ExpressionParameters theta = system.getGivenParameters();
     ConstraintMatrix matrix(system);
     const int m = system.getNumConstraints();
     ConstraintSystem::Jacobian jacobian(m);
-    system.evaluateJacobian(e.positions, jacobian);
+    system.evaluateJacobian(e.positions, theta, jacobian);
     Eigen::MatrixXd g = denseJacobian(system, e.positions);
     Eigen::MatrixXd k = g * denseInverseMasses(e.masses).asDiagonal() * g.transpose();
     for (int repeat = 0; repeat < 2; repeat++) { // the second factorisation reuses the pattern
@@ -150,14 +152,15 @@ void testMatrixAgainstDense(int chainLength) {
 void testNewtonMatrixAgainstDense(int chainLength) {
     Example e = makeExample(chainLength);
     ConstraintSystem system(e.masses, e.constraints);
+    const ExpressionParameters theta = system.getGivenParameters();
     NewtonMatrix matrix(system);
     const int m = system.getNumConstraints();
     vector<Vec3> ahead = e.positions;
     for (size_t i = 0; i < ahead.size(); i++)
         ahead[i] += e.velocities[i] * 0.05;
     ConstraintSystem::Jacobian current(m), next(m);
-    system.evaluateJacobian(e.positions, current);
-    system.evaluateJacobian(ahead, next);
+    system.evaluateJacobian(e.positions, theta, current);
+    system.evaluateJacobian(ahead, theta, next);
     Eigen::MatrixXd a = denseJacobian(system, ahead) * denseInverseMasses(e.masses).asDiagonal() *
                         denseJacobian(system, e.positions).transpose();
     Eigen::VectorXd b = Eigen::VectorXd::LinSpaced(m, -1, 2);
@@ -183,10 +186,11 @@ void testMasslessParticles() {
     // share an anchor do not meet at it.
     const std::string distance = "(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-1";
     const ConstraintSystem system({0, 2, 3}, {}, {{distance, {0, 1}, {}}, {distance, {2, 0}, {}}});
+    const ExpressionParameters theta = system.getGivenParameters();
     ASSERT_EQUAL(2 + 2, system.getNumEntries());
     const vector<Vec3> positions = {Vec3(), Vec3(1, 0, 0), Vec3(0, 1, 0)};
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(positions, jacobian);
+    system.evaluateJacobian(positions, theta, jacobian);
     const double nan = std::nan("");
     vector<Vec3> x(3, Vec3(5, 6, 7));
     system.addTransposedOverMass(jacobian, {nan, nan}, 1.0, x);
@@ -229,6 +233,7 @@ void testClustersOfDifferentLengths() {
     }
     VRattleDynamics dynamics(e.masses, e.constraints);
     const ConstraintSystem& system = dynamics.getConstraintSystem();
+    const ExpressionParameters theta = system.getGivenParameters();
     const int m = system.getNumConstraints();
     ASSERT_EQUAL(3, (int) system.getBatches().size());
     ASSERT_EQUAL(m, system.getFirstGeneral());
@@ -242,13 +247,13 @@ void testClustersOfDifferentLengths() {
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
     for (int step = 0; step < 5; step++) {
         dynamics.step(INFINITY);
-        ASSERT(system.evaluate(dynamics.getNextPositions(), g, jacobian) <= 1e-10);
+        ASSERT(system.evaluate(dynamics.getNextPositions(), theta, g, jacobian) <= 1e-10);
         vector<Vec3> sameForces = forces;
         ASSERT(dynamics.finish(sameForces, 0));
         const Eigen::MatrixXd rows = denseJacobian(system, dynamics.getPositions());
         const Eigen::VectorXd inverseMasses = denseInverseMasses(e.masses);
         assertSmall((rows * flatten(dynamics.getVelocities())).norm(), 1e-10);
-        system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), curvature);
+        system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), theta, curvature);
         const Eigen::VectorXd right =
             Eigen::VectorXd::Map(curvature.data(), m) + rows * inverseMasses.asDiagonal() * flatten(forces);
         const Eigen::VectorXd expected = (rows * inverseMasses.asDiagonal() * rows.transpose()).ldlt().solve(right);
@@ -260,9 +265,10 @@ void testClustersOfDifferentLengths() {
 static void assertDependent(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                             const vector<Vec3>& positions, const std::string& particles) {
     ConstraintSystem system(masses, constraints);
+    const ExpressionParameters theta = system.getGivenParameters();
     ConstraintMatrix matrix(system);
     ConstraintSystem::Jacobian jacobian(system.getNumConstraints());
-    system.evaluateJacobian(positions, jacobian);
+    system.evaluateJacobian(positions, theta, jacobian);
     assertThrows(particles, [&] { matrix.factorize(jacobian); });
 }
 
@@ -283,9 +289,10 @@ void testDependentConstraints() {
     assertDependent(e.masses, e.constraints, e.positions, "redundant");
     // A heavy-light-heavy line is strongly coupled and legitimate.
     ConstraintSystem system({1000, 1, 1000}, {{0, 1, 0.1}, {1, 2, 0.1}});
+    const ExpressionParameters theta = system.getGivenParameters();
     ConstraintMatrix matrix(system);
     ConstraintSystem::Jacobian jacobian(2);
-    system.evaluateJacobian({Vec3(0, 0, 0), Vec3(0.1, 0, 0), Vec3(0.2, 0, 0)}, jacobian);
+    system.evaluateJacobian({Vec3(0, 0, 0), Vec3(0.1, 0, 0), Vec3(0.2, 0, 0)}, theta, jacobian);
     matrix.factorize(jacobian);
 }
 

@@ -118,7 +118,9 @@ struct Sample {
             velocities.push_back(randomVector());
         }
         group.reset(new ExpressionGroup(constraint));
-        group->add(constraint, 0, 0, {1, 1, 1});
+        group->add(constraint, 0, 0, 0, {1, 1, 1});
+        theta.values = {0.7, -0.4};
+        theta.rates = {0, 0};
     }
     double& at(vector<Vec3>& x, int variable) const {
         return x[constraint.particles[variable / 3]][variable % 3];
@@ -131,12 +133,12 @@ struct Sample {
     }
     double value(const vector<Vec3>& x) {
         vector<double> g(1);
-        group->evaluate(x, g, 0, 1);
+        group->evaluate(x, theta, g, 0, 1);
         return g[0];
     }
     double curvature(const vector<Vec3>& v) {
         vector<double> result(1);
-        group->evaluateCurvature(positions, v, result, 0, 1);
+        group->evaluateCurvature(positions, v, theta, result, 0, 1);
         return result[0];
     }
     vector<double> inOrder(const vector<Vec3>& rows) {
@@ -147,15 +149,16 @@ struct Sample {
     }
     vector<double> gradient(const vector<Vec3>& x) {
         vector<Vec3> rows(NUM_PARTICLES);
-        group->evaluateJacobian(x, rows, 0, 1);
+        group->evaluateJacobian(x, theta, rows, 0, 1);
         return inOrder(rows);
     }
     vector<double> velocityRow(const vector<Vec3>& v) {
         vector<Vec3> rows(NUM_PARTICLES);
-        group->evaluateVelocityJacobian(positions, v, rows, 0, 1);
+        group->evaluateVelocityJacobian(positions, v, theta, rows, 0, 1);
         return inOrder(rows);
     }
     ExpressionConstraint constraint;
+    ExpressionParameters theta;
     vector<Vec3> positions, velocities;
     std::unique_ptr<ExpressionGroup> group;
 };
@@ -313,29 +316,32 @@ void testGroups() {
         }
         ExpressionGroup together(example);
         for (int i = 0; i < count; i++)
-            together.add(constraints[i], count - 1 - i, 2 * i, inverseMasses);
-        constraints[count / 2].parameters["k"] = 0.1;
-        together.setParameters(count / 2, constraints[count / 2].parameters);
+            together.add(constraints[i], count - 1 - i, 2 * i, 2 * i, inverseMasses);
+        ExpressionParameters theta;
+        for (int i = 0; i < count; i++)
+            for (const char* name : {"d", "k"})
+                theta.values.push_back(constraints[i].parameters.at(name));
         vector<double> g(count), curvature(count);
         vector<Vec3> rows(2 * count), velocityRows(2 * count);
         const int cut = count / 3; // in two ranges
         for (const auto& range : {std::make_pair(0, cut), std::make_pair(cut, count)}) {
-            together.evaluate(q, g, range.first, range.second);
-            together.evaluateCurvature(q, v, curvature, range.first, range.second);
-            together.evaluateJacobian(q, rows, range.first, range.second);
-            together.evaluateVelocityJacobian(q, v, velocityRows, range.first, range.second);
+            together.evaluate(q, theta, g, range.first, range.second);
+            together.evaluateCurvature(q, v, theta, curvature, range.first, range.second);
+            together.evaluateJacobian(q, theta, rows, range.first, range.second);
+            together.evaluateVelocityJacobian(q, v, theta, velocityRows, range.first, range.second);
         }
         for (int i = 0; i < count; i++) {
             ExpressionGroup alone(constraints[i]);
-            alone.add(constraints[i], 0, 0, inverseMasses);
+            alone.add(constraints[i], 0, 0, 0, inverseMasses);
+            const ExpressionParameters own{{theta.values[2 * i], theta.values[2 * i + 1]}, {}, false};
             vector<double> number(1);
             vector<Vec3> row(2), velocityRow(2);
-            alone.evaluate(q, number, 0, 1);
+            alone.evaluate(q, own, number, 0, 1);
             ASSERT_EQUAL(number[0], g[count - 1 - i]);
-            alone.evaluateCurvature(q, v, number, 0, 1);
+            alone.evaluateCurvature(q, v, own, number, 0, 1);
             ASSERT_EQUAL(number[0], curvature[count - 1 - i]);
-            alone.evaluateJacobian(q, row, 0, 1);
-            alone.evaluateVelocityJacobian(q, v, velocityRow, 0, 1);
+            alone.evaluateJacobian(q, own, row, 0, 1);
+            alone.evaluateVelocityJacobian(q, v, own, velocityRow, 0, 1);
             for (int p = 0; p < 2; p++) {
                 ASSERT(row[p] == rows[2 * i + p]);
                 ASSERT(velocityRow[p] == velocityRows[2 * i + p]);
@@ -346,7 +352,7 @@ void testGroups() {
             if (i % 3 == 0) {
                 v[2 * i] = Vec3(5, 5, 5);
                 const double before = number[0];
-                alone.evaluateCurvature(q, v, number, 0, 1);
+                alone.evaluateCurvature(q, v, own, number, 0, 1);
                 ASSERT_EQUAL(before, number[0]);
             }
         }
@@ -422,16 +428,17 @@ Eigen::VectorXd denseInverseMasses(const vector<double>& masses) {
 // The Jacobian by differences of g itself.
 Eigen::MatrixXd denseJacobian(const ConstraintSystem& system, const vector<Vec3>& q) {
     const double h = 1e-6;
+    const ExpressionParameters theta = system.getGivenParameters();
     ConstraintSystem::Jacobian nearby(system.getNumEntries());
-    system.evaluateJacobian(q, nearby);
+    system.evaluateJacobian(q, theta, nearby);
     vector<double> plus(system.getNumConstraints()), minus(system.getNumConstraints());
     Eigen::MatrixXd result(system.getNumConstraints(), 3 * q.size());
     for (size_t i = 0; i < 3 * q.size(); i++) {
         vector<Vec3> ahead = q, back = q;
         ahead[i / 3][i % 3] += h;
         back[i / 3][i % 3] -= h;
-        system.evaluate(ahead, plus, nearby);
-        system.evaluate(back, minus, nearby);
+        system.evaluate(ahead, theta, plus, nearby);
+        system.evaluate(back, theta, minus, nearby);
         result.col(i) = (flattenNumbers(plus) - flattenNumbers(minus)) / (2 * h);
     }
     return result;
@@ -446,13 +453,14 @@ void assertClose(const Eigen::VectorXd& expected, const Eigen::VectorXd& found, 
 void testAgainstDense(int chainLength) {
     MixedSystem e(chainLength);
     ConstraintSystem system(e.masses, e.distances, e.expressions);
+    const ExpressionParameters theta = system.getGivenParameters();
     const int m = system.getNumConstraints();
     ASSERT_EQUAL((int) (e.distances.size() + e.expressions.size()), m);
     ASSERT_EQUAL(9, system.getFirstGeneral()); // the three waters without an expression
     const Eigen::VectorXd inverseMasses = denseInverseMasses(e.masses);
     const Eigen::MatrixXd dense = denseJacobian(system, e.positions);
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(e.positions, jacobian);
+    system.evaluateJacobian(e.positions, theta, jacobian);
 
     vector<double> result(m);
     system.multiply(jacobian, e.velocities, result);
@@ -504,7 +512,7 @@ void testAgainstDense(int chainLength) {
         if (e.masses[i] > 0)
             ahead[i] += e.velocities[i] * 0.02;
     ConstraintSystem::Jacobian next(system.getNumEntries());
-    system.evaluateJacobian(ahead, next);
+    system.evaluateJacobian(ahead, theta, next);
     NewtonMatrix newton(system);
     ASSERT(newton.factorize(next, jacobian));
     vector<double> solution = x;
@@ -512,31 +520,58 @@ void testAgainstDense(int chainLength) {
     const Eigen::MatrixXd a = denseJacobian(system, ahead) * inverseMasses.asDiagonal() * dense.transpose();
     assertClose(flattenNumbers(x), a * flattenNumbers(solution), 1e-5);
 
-    // g''(v,v) and half its derivative
-    const double h = 1e-5;
-    vector<Vec3> forward = e.positions, backward = e.positions;
-    for (size_t i = 0; i < forward.size(); i++) {
-        forward[i] += moving[i] * h;
-        backward[i] -= moving[i] * h;
-    }
-    ConstraintSystem::Jacobian forwardRows(system.getNumEntries()), backwardRows = forwardRows, rows = forwardRows;
-    system.evaluateJacobian(forward, forwardRows);
-    system.evaluateJacobian(backward, backwardRows);
-    system.evaluateVelocityJacobian(e.positions, moving, rows);
-    for (int entry = 0; entry < system.getNumEntries(); entry++)
-        for (int j = 0; j < 3; j++) {
-            const double difference = (forwardRows[entry][j] - backwardRows[entry][j]) / (2 * h);
-            ASSERT(std::fabs(difference - rows[entry][j]) <= 1e-5 * (1 + std::fabs(difference)));
+    // g''(v,v) and half its derivative, with parameters at rest and moving
+    for (bool isMoving : {false, true}) {
+        ExpressionParameters theta = system.getGivenParameters();
+        theta.isMoving = isMoving;
+        if (isMoving)
+            for (double& rate : theta.rates)
+                rate = uniform(-0.3, 0.3);
+        const double h = 1e-5;
+        ExpressionParameters thetaForward = theta, thetaBackward = theta;
+        for (size_t i = 0; i < theta.values.size(); i++) {
+            thetaForward.values[i] += theta.rates[i] * h;
+            thetaBackward.values[i] -= theta.rates[i] * h;
         }
-    vector<double> curvature(m);
-    system.evaluateCurvature(e.positions, moving, curvature);
-    system.multiply(rows, moving, result);
-    assertClose(flattenNumbers(curvature), flattenNumbers(result), 1e-12);
+        vector<Vec3> forward = e.positions, backward = e.positions;
+        for (size_t i = 0; i < forward.size(); i++) {
+            forward[i] += moving[i] * h;
+            backward[i] -= moving[i] * h;
+        }
+        ConstraintSystem::Jacobian forwardRows(system.getNumEntries()), backwardRows = forwardRows, rows = forwardRows;
+        system.evaluateJacobian(forward, thetaForward, forwardRows);
+        system.evaluateJacobian(backward, thetaBackward, backwardRows);
+        system.evaluateVelocityJacobian(e.positions, moving, theta, rows);
+        for (int entry = 0; entry < system.getNumEntries(); entry++)
+            for (int j = 0; j < 3; j++) {
+                const double difference = (forwardRows[entry][j] - backwardRows[entry][j]) / (2 * h);
+                ASSERT(std::fabs(difference - rows[entry][j]) <= 1e-5 * (1 + std::fabs(difference)));
+            }
+        vector<double> curvature(m);
+        system.evaluateCurvature(e.positions, moving, theta, curvature);
+        if (!isMoving) {
+            system.multiply(rows, moving, result);
+            assertClose(flattenNumbers(curvature), flattenNumbers(result), 1e-12);
+        }
+        // dg/dt and its change in time
+        vector<double> plus(m), minus(m);
+        system.evaluate(forward, thetaForward, plus, forwardRows);
+        system.evaluate(backward, thetaBackward, minus, backwardRows);
+        system.multiply(jacobian, moving, result);
+        system.addParameterMotion(e.positions, theta, result);
+        assertClose((flattenNumbers(plus) - flattenNumbers(minus)) / (2 * h), flattenNumbers(result), 1e-6);
+        system.multiply(forwardRows, moving, plus);
+        system.addParameterMotion(forward, thetaForward, plus);
+        system.multiply(backwardRows, moving, minus);
+        system.addParameterMotion(backward, thetaBackward, minus);
+        assertClose((flattenNumbers(plus) - flattenNumbers(minus)) / (2 * h), flattenNumbers(curvature), 1e-6);
+    }
 }
 
 void testGivenOrder() {
     // Multipliers come back in the order of the constructor, distances first; those of expressions as they are.
     ConstraintSystem system({1, 2, 3, 4}, {{2, 3, 0.5}, {0, 1, 2.0}}, {{"x1-1", {2}, {}}, {"y1-1", {0}, {}}});
+    const ExpressionParameters theta = system.getGivenParameters();
     vector<double> multipliers;
     for (int k = 0; k < system.getNumConstraints(); k++)
         multipliers.push_back(system.isExpression(k) ? 100.0 + system.describe(k)[22] - '0'
@@ -554,20 +589,22 @@ void testGivenOrder() {
 void testErrors() {
     for (const char* expression : {"z1", "1000*z1", "1e-7*z1", "(1+z1)^3-1"}) {
         ConstraintSystem system({2}, {}, {{expression, {0}, {}}});
+        const ExpressionParameters theta = system.getGivenParameters();
         ConstraintSystem::Jacobian jacobian(system.getNumEntries());
         vector<double> g(1);
-        system.evaluateJacobian({Vec3(3, 4, 0)}, jacobian);
-        ASSERT_EQUAL_TOL(1e-5, system.evaluate({Vec3(1, 2, 1e-6)}, g, jacobian), 2e-6);
-        ASSERT(system.evaluate({Vec3(1, 2, 0)}, g, jacobian) == 0);
+        system.evaluateJacobian({Vec3(3, 4, 0)}, theta, jacobian);
+        ASSERT_EQUAL_TOL(1e-5, system.evaluate({Vec3(1, 2, 1e-6)}, theta, g, jacobian), 2e-6);
+        ASSERT(system.evaluate({Vec3(1, 2, 0)}, theta, g, jacobian) == 0);
     }
 }
 
 static void assertFailure(const string& text, const vector<double>& masses, const vector<ExpressionConstraint>& given,
                           const vector<Vec3>& positions) {
     ConstraintSystem system(masses, {}, given);
+    const ExpressionParameters theta = system.getGivenParameters();
     ConstraintMatrix matrix(system);
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(positions, jacobian);
+    system.evaluateJacobian(positions, theta, jacobian);
     assertThrows(text, [&] { matrix.factorize(jacobian); });
 }
 
@@ -615,6 +652,7 @@ void testFillOfRod() {
             }
         }
         ConstraintSystem system(masses, distances, expressions);
+        const ExpressionParameters theta = system.getGivenParameters();
         ASSERT_EQUAL(6 * (sections - 1), system.getNumConstraints());
         fill.push_back((double) countFill(system));
         // Blocks of six: 15 entries in each and at most 36 between neighbours.
@@ -642,6 +680,7 @@ void testFillOfCentreOfMass() {
     for (const string& sum : sums)
         expressions.push_back({sum, oxygens, {}});
     ConstraintSystem system(masses, distances, expressions);
+    const ExpressionParameters theta = system.getGivenParameters();
     ASSERT_EQUAL(0, system.getFirstGeneral());
     ASSERT(countFill(system) <= (size_t) (waters * (3 + 9) + 3));
 }

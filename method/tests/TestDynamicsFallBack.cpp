@@ -69,8 +69,8 @@ void testScalesOfNewtonMatrix(int bonds) {
         for (Vec3& position : ahead)
             position += Vec3(std::sin(90 * position[0]), std::cos(80 * position[0]), std::sin(70 * position[0])) * 0.01;
         ConstraintSystem::Jacobian current(system.getNumEntries()), next = current;
-        system.evaluateJacobian(e.positions, current);
-        system.evaluateJacobian(ahead, next);
+        system.evaluateJacobian(e.positions, system.getGivenParameters(), current);
+        system.evaluateJacobian(ahead, system.getGivenParameters(), next);
         auto dense = [&](const ConstraintSystem::Jacobian& jacobian) {
             Eigen::MatrixXd result = Eigen::MatrixXd::Zero(bonds, 3 * (bonds + 1));
             for (const auto& row : system.getExpressionRows())
@@ -91,7 +91,7 @@ void testScalesOfNewtonMatrix(int bonds) {
         doubled.expressions.push_back({"7*" + e.expressions[3].expression, e.expressions[3].particles, {}});
         const ConstraintSystem dependent(e.masses, {}, doubled.expressions);
         ConstraintSystem::Jacobian rows(dependent.getNumEntries());
-        dependent.evaluateJacobian(e.positions, rows);
+        dependent.evaluateJacobian(e.positions, dependent.getGivenParameters(), rows);
         NewtonMatrix singular(dependent);
         ASSERT(!singular.factorize(rows, rows));
     }

@@ -39,10 +39,10 @@ struct Example {
 class Evaluation {
 public:
     Evaluation(const Example& e, vector<StepMonitor::Term> terms, double order) :
-            e(e), system(e.masses, e.constraints, e.expressions), matrix(system), monitor(system),
-            jacobian(system.getNumEntries()), applied(system.getNumConstraints()),
+            e(e), system(e.masses, e.constraints, e.expressions), theta(system.getGivenParameters()), matrix(system),
+            monitor(system), jacobian(system.getNumEntries()), applied(system.getNumConstraints()),
             multipliers(system.getNumConstraints()) {
-        system.evaluateJacobian(e.positions, jacobian);
+        system.evaluateJacobian(e.positions, theta, jacobian);
         matrix.factorize(jacobian);
         system.multiplyOverMass(jacobian, e.forces, applied);
         for (StepMonitor::Term& term : terms)
@@ -51,7 +51,7 @@ public:
         monitor.setForces(e.forces, 4.2);
     }
     double u(const vector<Vec3>& v) {
-        system.evaluateCurvature(e.positions, v, multipliers);
+        system.evaluateCurvature(e.positions, v, theta, multipliers);
         for (size_t k = 0; k < multipliers.size(); k++)
             multipliers[k] += applied[k];
         rightSide = multipliers;
@@ -64,7 +64,7 @@ public:
         u(v);
         vector<double> multiplierRate(multipliers.size());
         ConstraintSystem::Jacobian velocityJacobian(system.getNumEntries());
-        system.evaluateVelocityJacobian(e.positions, v, velocityJacobian);
+        system.evaluateVelocityJacobian(e.positions, v, theta, velocityJacobian);
         system.multiply(velocityJacobian, change, multiplierRate);
         for (double& x : multiplierRate)
             x *= 2;
@@ -74,11 +74,12 @@ public:
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
         vector<Vec3> result(v.size());
-        monitor.evaluateGradient(e.positions, v, multipliers, values, matrix, result);
+        monitor.evaluateGradient(e.positions, theta, v, multipliers, values, matrix, result);
         return result;
     }
     const Example& e;
     ConstraintSystem system;
+    ExpressionParameters theta;
     ConstraintMatrix matrix;
     StepMonitor monitor;
     ConstraintSystem::Jacobian jacobian;

@@ -33,7 +33,8 @@ static Vec3 randomVector(double scale) {
 
 static SparseMatrix sparseJacobian(const ConstraintSystem& system, const vector<Vec3>& q) {
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(q, jacobian);
+    const ExpressionParameters theta = system.getGivenParameters();
+    system.evaluateJacobian(q, theta, jacobian);
     vector<Eigen::Triplet<double>> triplets;
     auto add = [&](int k, int particle, const Vec3& row) {
         for (int j = 0; j < 3; j++)
@@ -112,11 +113,12 @@ void testCut() {
 
 void testMatrix(const Example& e) {
     ConstraintSystem system(e.masses, e.distances, e.expressions);
+    const ExpressionParameters theta = system.getGivenParameters();
     ASSERT_EQUAL(1, (int) system.getCutClusters().size());
     ASSERT(system.getPieces().size() > 10);
     ConstraintMatrix matrix(system);
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
-    system.evaluateJacobian(e.positions, jacobian);
+    system.evaluateJacobian(e.positions, theta, jacobian);
     const SparseMatrix g = sparseJacobian(system, e.positions);
     const SparseMatrix k = g * sparseInverseMasses(system) * g.transpose();
     vector<double> b(system.getNumConstraints());
@@ -156,12 +158,13 @@ void testMatrix(const Example& e) {
 // The matrix of Newton's iteration, which takes a cut cluster as a whole.
 void testNewtonMatrix(const Example& e) {
     ConstraintSystem system(e.masses, e.distances, e.expressions);
+    const ExpressionParameters theta = system.getGivenParameters();
     vector<Vec3> ahead = e.positions;
     for (size_t i = 0; i < ahead.size(); i++)
         ahead[i] += e.velocities[i] * 0.02;
     ConstraintSystem::Jacobian current(system.getNumEntries()), next = current;
-    system.evaluateJacobian(e.positions, current);
-    system.evaluateJacobian(ahead, next);
+    system.evaluateJacobian(e.positions, theta, current);
+    system.evaluateJacobian(ahead, theta, next);
     const SparseMatrix a =
         sparseJacobian(system, ahead) * sparseInverseMasses(system) * sparseJacobian(system, e.positions).transpose();
     vector<double> b(system.getNumConstraints());
@@ -186,6 +189,7 @@ void testSteps(const Example& e, StepDensity::Update update) {
     takeSteps(dynamics, 1);
     const vector<Vec3> after = dynamics.getPositions();
     const ConstraintSystem& system = dynamics.getConstraintSystem();
+    const ExpressionParameters theta = system.getGivenParameters();
     const double reference = dynamics.getReferences()[0];
     vector<double> g(system.getNumConstraints()), curvature(system.getNumConstraints());
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
@@ -193,9 +197,9 @@ void testSteps(const Example& e, StepDensity::Update update) {
         const double before = dynamics.getDensity(), u = dynamics.getMonitorValues()[0] / reference;
         takeSteps(dynamics, 1);
         const vector<Vec3>&q = dynamics.getPositions(), &v = dynamics.getVelocities();
-        system.evaluateJacobian(q, jacobian);
-        ASSERT(system.evaluate(q, g, jacobian) <= 1e-10);
-        system.evaluateCurvature(q, v, curvature);
+        system.evaluateJacobian(q, theta, jacobian);
+        ASSERT(system.evaluate(q, theta, g, jacobian) <= 1e-10);
+        system.evaluateCurvature(q, v, theta, curvature);
         const SparseMatrix rows = sparseJacobian(system, q), inverseMasses = sparseInverseMasses(system);
         ASSERT((rows * flatten(v)).cwiseAbs().maxCoeff() < 1e-10); // the velocities are tangent
         const SparseMatrix k = rows * inverseMasses * rows.transpose();
@@ -221,17 +225,18 @@ void testProjection(const Example& e) {
     VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
     dynamics.setSettings(makeSettings(StepDensity::Explicit));
     const ConstraintSystem& system = dynamics.getConstraintSystem();
+    const ExpressionParameters theta = system.getGivenParameters();
     vector<Vec3> positions = e.positions;
     for (size_t i = 0; i < positions.size(); i++)
         if (e.masses[i] > 0)
             positions[i] += randomVector(0.0002);
     ConstraintSystem::Jacobian jacobian(system.getNumEntries());
     vector<double> g(system.getNumConstraints());
-    system.evaluateJacobian(positions, jacobian);
-    ASSERT(system.evaluate(positions, g, jacobian) > 0.003);
+    system.evaluateJacobian(positions, theta, jacobian);
+    ASSERT(system.evaluate(positions, theta, g, jacobian) > 0.003);
     ASSERT(dynamics.projectPositions(positions));
-    system.evaluateJacobian(positions, jacobian);
-    ASSERT(system.evaluate(positions, g, jacobian) <= 1e-10);
+    system.evaluateJacobian(positions, theta, jacobian);
+    ASSERT(system.evaluate(positions, theta, g, jacobian) <= 1e-10);
 }
 
 // A doubled bond is found within a piece and among the joints.

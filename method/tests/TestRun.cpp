@@ -24,7 +24,7 @@ public:
     bool failsToStart = false;
     Change change = Change::None;
     bool areForcesInvalid = false;
-    unsigned long long fingerprint = 1;
+    unsigned long long fingerprint = 1, parameters = 1;
     long long numAsked = 0, numTaken = 0;
     int numLooks = 0; // at numbers that a device would have to wait for, while it has been asked for steps
     double lastSize = 0;
@@ -48,6 +48,14 @@ public:
     }
     unsigned long long getFingerprint() override {
         return fingerprint;
+    }
+    unsigned long long getParameterFingerprint() override {
+        return parameters;
+    }
+    void changeForces() override {
+        calls += 'F';
+        if (failsToStart)
+            throw StepFailure("of this or that");
     }
     void start() override {
         calls += 'A';
@@ -137,9 +145,9 @@ public:
     bool canResume(const RunState&, const IntegratorSettings&) override {
         return true;
     }
-    bool resume(const RunState&, const IntegratorSettings&) override {
+    bool resume(const RunState&, const IntegratorSettings&, bool areForcesOthers) override {
         calls += 'r';
-        return areForcesAsSaved;
+        return areForcesAsSaved || areForcesOthers;
     }
     bool areForcesAsSaved = true;
     string takeCalls() {
@@ -223,6 +231,63 @@ void testChanges() {
     ASSERT_EQUAL(string("CCAA+."), e.device.takeCalls());
 }
 
+// Parameters of Forces and of constraints.
+void testParameters() {
+    Example e;
+    e.settings.expressions = {{"x1-d", {0}, {{"d", 1.0}}}};
+    IntegratorRun run(e.device, e.settings, 0, SYSTEM);
+    e.device.takeCalls();
+    auto setParameter = [&](double value) {
+        e.settings.expressions[0].parameters["d"] = value;
+        run.settingsChanged();
+    };
+    // Before the first step whoever asks for numbers asks for those where the constraint holds; a step goes there.
+    run.getMultipliers();
+    setParameter(2);
+    run.getMultipliers();
+    setParameter(3);
+    run.step(1);
+    setParameter(4);
+    run.step(1);
+    ASSERT_EQUAL(string("AsAs+.s+."), e.device.takeCalls());
+    run.forcesChanged();
+    run.step(2);
+    run.getMultipliers();
+    ASSERT_EQUAL(string("F++."), e.device.takeCalls());
+    run.forcesChanged();
+    e.device.change = RunDevice::Change::Velocities;
+    run.step(1);
+    run.forcesChanged();
+    e.device.change = RunDevice::Change::State; // computes the forces anyway
+    run.step(1);
+    e.device.change = RunDevice::Change::None;
+    run.step(1);
+    ASSERT_EQUAL(string("VF+.C+.+."), e.device.takeCalls());
+    run.forcesChanged();
+    e.device.failsToStart = true;
+    assertThrows("of this or that", [&] { run.step(1); });
+    e.device.failsToStart = false;
+    run.step(1);
+    ASSERT_EQUAL(string("FF+."), e.device.takeCalls());
+    // Saved before the step that meets the change, and loaded where parameters are others.
+    run.forcesChanged();
+    const RunState state = run.save();
+    e.device.areForcesAsSaved = false;
+    run.resume(state);
+    run.step(1);
+    ASSERT_EQUAL(string("wsrF+."), e.device.takeCalls());
+    RunState met = run.save();
+    run.resume(met);
+    e.device.parameters = 2;
+    run.forcesChanged();
+    run.step(1);
+    ASSERT_EQUAL(string("wsrF+."), e.device.takeCalls());
+    run.resume(met);
+    e.device.parameters = 1;
+    run.step(1);
+    ASSERT_EQUAL(string("srA+."), e.device.takeCalls()); // other forces, without a word
+}
+
 void testSettings() {
     Example e;
     e.run.step(1);
@@ -294,6 +359,7 @@ int main() {
         {"steps are asked for without a look", testStepsAreAskedForWithoutALook},
         {"failures that are found late", testFailuresThatAreFoundLate},
         {"changes", testChanges},
+        {"parameters", testParameters},
         {"settings", testSettings},
         {"saved runs", testSavedRuns},
     });

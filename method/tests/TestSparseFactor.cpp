@@ -250,7 +250,7 @@ void testStar() {
     Eigen::MatrixXd rows = Eigen::MatrixXd::Zero(m, 3 * e.masses.size());
     Eigen::VectorXd inverseMasses(rows.cols()), right(m);
     vector<double> curvature(m);
-    system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), curvature);
+    system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), dynamics.getParameters(), curvature);
     for (int i = 0; i < rows.cols(); i++)
         inverseMasses[i] = 1 / e.masses[i / 3];
     for (int k = 0; k < m; k++) {

@@ -31,7 +31,7 @@ using std::vector;
 namespace {
 
 // Of the parameters that States hold; the settings among them have a version of their own.
-const int PARAMETERS_VERSION = 1;
+const int PARAMETERS_VERSION = 2;
 // Its square, by which multipliers act on positions, must not vanish.
 const double SMALLEST_STEP_SIZE = 1e-100;
 const char TYPE_NAME[] = "VariableStepRattleIntegrator";
@@ -489,8 +489,13 @@ vector<string> VariableStepRattleIntegrator::getKernelNames() {
     return {IntegrateVRattleStepKernel::Name()};
 }
 
-void VariableStepRattleIntegrator::stateChanged(State::DataType) {
-    if (run != nullptr) // not where Context::reinitialize() has failed
+void VariableStepRattleIntegrator::stateChanged(State::DataType changed) {
+    if (run == nullptr) // where Context::reinitialize() has failed
+        return;
+    // OpenMM announces Context::setParameter() as Parameters, and a Force's updateParametersInContext() as Energy.
+    if (changed == State::Parameters || changed == State::Energy)
+        run->forcesChanged();
+    else
         run->stateChanged();
 }
 

@@ -725,7 +725,13 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     def setExpressionParameterValue(self, index: int, name: str, value: float | unit.Quantity) -> None:
         """Change the value of one parameter of a constraint.
 
-        It is in force at the next step, which starts the run afresh from positions that satisfy the constraint.
+        The next step moves the particles there: its end satisfies the constraint, with velocities v that belong to
+        the motion, dg/dq v = -dg/dparameter (new - old)/(size of the step). It costs no evaluation of the forces, and
+        the step density goes on. The work that the motion does on the particles is the multiplier times
+        dg/dparameter times the change of the parameter; take the mean of the multipliers before and after the step
+        (docs/constraints.md has an example). A change that no step can make fails as a step, and the value stays as
+        it was set. Before the first step after the user has set positions or velocities, numbers that are asked for
+        are those of particles put on the constraint, without a motion.
 
         Parameters
         ----------
@@ -954,8 +960,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     ) -> None:
         """Change a constraint.
 
-        New values of its parameters are in force at the next step, which starts the run afresh from positions that
-        satisfy the constraint; another expression, other particles or other names take effect with
+        New values of its parameters are met by the next step, which moves the particles there; see
+        setExpressionParameterValue(). Another expression, other particles or other names take effect with
         Context.reinitialize(), as for addConstraint().
 
         Parameters

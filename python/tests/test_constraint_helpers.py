@@ -235,7 +235,9 @@ def test_distance_difference_is_a_plane_or_a_hyperbola() -> None:
     slope = 2 * 0.2 / np.linalg.norm(expected - anchors[0])
     assert integrator.getExpressionConstraintMultiplier(index) == pytest.approx(force[0] / slope, rel=1e-10)
     # On the hyperbola x = a sqrt(1 + (y^2+z^2)/b^2) with 2a the difference.
+    # A run that starts anew is moved there without being pulled.
     integrator.setExpressionParameterValue(index, "difference", 0.2 * unit.nanometer)
+    context.setVelocities(velocities_of(context))
     drift = []
     for _ in range(200):
         integrator.step(1)

@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
-from dense_reference import UPDATES, Array, energy_of, general, open_context, positions_of, time_of, velocities_of
+from dense_reference import (
+    UPDATES,
+    Array,
+    energy_of,
+    general,
+    open_context,
+    positions_of,
+    time_of,
+    value,
+    velocities_of,
+)
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator, XmlSerializer
 
@@ -408,18 +418,66 @@ def test_where_nothing_pulls_there_is_no_measure() -> None:
 
 def test_a_new_value_takes_effect_at_once(platform: str) -> None:
     integrator, context = on_sphere(platform=platform)
-    integrator.step(20)
+    # Before the first step the positions are moved there, where the multiplier is known without a step.
     integrator.setExpressionParameterValue(0, "r", 1.1 * unit.nanometer)
-    before = positions_of(context)[0]
-    # The run starts afresh from the nearest position, at which the multiplier is known without a step.
-    v = velocities_of(context)[0]
-    multiplier = integrator.getExpressionConstraintMultiplier(0)
-    assert multiplier == pytest.approx(2.0 * v @ v / 1.1 - 20 * before[2], rel=1e-9)
+    z, speed = positions_of(context)[0, 2], 1.0
+    expected = 2.0 * speed**2 / 1.1 - 20 * z
+    assert integrator.getExpressionConstraintMultiplier(0) == pytest.approx(expected, rel=1e-9)
+    integrator.step(20)
+    # Afterwards the next step goes there.
+    before, v = positions_of(context)[0], velocities_of(context)[0]
+    integrator.setExpressionParameterValue(0, "r", 1.102 * unit.nanometer)
+    expected = 2.0 * v @ v / 1.1 - 20 * before[2] / 1.1
+    assert integrator.getExpressionConstraintMultiplier(0) == pytest.approx(expected, rel=1e-4)
+    evaluations = integrator.getNumForceEvaluations()
     integrator.step(1)
-    assert np.linalg.norm(positions_of(context)[0]) == pytest.approx(1.1, abs=1e-11)
+    assert integrator.getNumForceEvaluations() == evaluations + 1
+    q, v, dt = positions_of(context)[0], velocities_of(context)[0], value(integrator.getStepSize())
+    assert np.linalg.norm(q) == pytest.approx(1.102, abs=1e-11)
+    assert q @ v / 1.102 == pytest.approx(0.002 / dt, rel=1e-6)
     integrator.setExpressionConstraintParameters(0, SPHERE, [0], {"r": 0.9})
     integrator.step(5)
     assert np.linalg.norm(positions_of(context)[0]) == pytest.approx(0.9, abs=1e-11)
+
+
+def shorten(steps: int) -> tuple[float, float, float]:
+    """A dumbbell that turns, shortened from 0.4 to 0.3 nm within 2 ps: work, change of energy, angular momentum."""
+    integrator = VariableStepRattleIntegrator(2 / steps, monitors=[])
+    integrator.addConstraint("(x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2 - d^2", [0, 1], {"d": 0.4})
+    context = open_context(particles(3.0, 5.0), integrator, "Reference")
+    context.setPositions([[0.25, 0, 0], [-0.15, 0, 0]])
+    context.setVelocities([[0, 1.0, 0], [0, -0.6, 0]])
+    distance, change, work, first = 0.4, -0.1 / steps, 0.0, 0.0
+    evaluations = 0
+    for step in range(steps):
+        before = integrator.getExpressionConstraintMultiplier(0) * -2 * distance  # times dg/dd
+        if step == 0:
+            evaluations = integrator.getNumForceEvaluations()
+        distance += change
+        integrator.setExpressionParameterValue(0, "d", distance)
+        integrator.step(1)
+        if step == 0:
+            first = energy_of(context)
+        else:
+            work += 0.5 * (before + integrator.getExpressionConstraintMultiplier(0) * -2 * distance) * change
+    assert integrator.getNumForceEvaluations() == evaluations + steps
+    q, v = positions_of(context), velocities_of(context)
+    assert (q[0] - q[1]) @ (v[0] - v[1]) / distance == pytest.approx(-0.05, abs=1e-9)
+    return work, energy_of(context) - first, np.cross(q, v)[:, 2] @ [3.0, 5.0]
+
+
+def test_a_constraint_that_moves_does_work() -> None:
+    """The work is the change of the energy to second order, and both are as the angular momentum demands."""
+    momentum, reduced = 1.2, 15 / 8  # 0.4 nm * 1.6 nm/ps * 15/8 amu
+    errors = []
+    for steps in (500, 1000, 4000):
+        work, change, found = shorten(steps)
+        assert found == pytest.approx(momentum, rel=1e-6)
+        exact = momentum**2 / (2 * reduced) * (1 / 0.3**2 - 1 / (0.4 - 0.1 / steps) ** 2)
+        assert change == pytest.approx(exact, rel=1e-3)
+        errors.append(abs(work - change))
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)
+    assert errors[2] < 1e-4
 
 
 def test_an_old_value_changes_nothing() -> None:

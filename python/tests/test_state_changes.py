@@ -78,8 +78,6 @@ CHANGES: list[Change] = [
     change_positions,
     change_velocities,
     change_temperature,
-    change_parameter,
-    update_parameters,
     displace_and_constrain,
     minimise,
 ]
@@ -115,6 +113,36 @@ def test_a_change_starts_a_run_of_its_own(change: Change, update: str, platform:
     # The test could fail: going on as before would lead elsewhere.
     alone.step(30)
     assert np.max(np.abs(positions_of(unchanged) - positions_of(context))) > 1e-5
+
+
+@pytest.mark.parametrize("update", UPDATES)
+@pytest.mark.parametrize("change", [change_parameter, update_parameters])
+def test_forces_that_change_cost_one_evaluation(change: Change, update: str, platform: str) -> None:
+    """The run goes on with the new forces, and its density with the ratio to the monitor that it had."""
+    system, force = chain_in_a_box()
+    integrator = with_update(make_integrator(kind="ConstraintAndAppliedForce"), update)
+    context = open_context(system, integrator, platform, chain())
+    integrator.step(40)
+    evaluations = integrator.getNumForceEvaluations()
+    arguments = change(context, force)
+    energies, densities = [], []
+    for _ in range(30):
+        integrator.step(1)
+        energies.append(value(context.getState(energy=True).getPotentialEnergy()))
+        energies[-1] += value(context.getState(energy=True).getKineticEnergy())
+        densities.append(integrator.getStepDensity())
+    assert integrator.getNumForceEvaluations() == evaluations + 31
+    # The step is ten times as hard, and the density does not swing to and fro about it.
+    assert np.max(np.abs(np.diff(densities, 2)) / densities[0]) < 0.3
+    # What is conserved from now on is the energy with the new forces.
+    other = VariableStepRattleIntegrator(0.0005, monitors=[])
+    fresh = open_context(chain_in_a_box(**arguments)[0], other, platform)
+    fresh.setPositions(positions_of(context))
+    fresh.setVelocities(velocities_of(context))
+    assert value(fresh.getState(energy=True).getPotentialEnergy()) + value(
+        fresh.getState(energy=True).getKineticEnergy()
+    ) == pytest.approx(energies[-1], rel=1e-6)
+    assert max(energies) - min(energies) < 1e-3 * abs(energies[0])
 
 
 @pytest.mark.parametrize("update", UPDATES)

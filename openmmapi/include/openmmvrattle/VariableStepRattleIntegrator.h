@@ -40,7 +40,7 @@ struct RunState;
  * For most uses let the integrator choose its steps without a monitor of yours: useAutomaticStepControl().
  *
  * Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run, and after each
- * change of the state by the user or by a Force that moves particles (a barostat); one more where the first step is taken with a given
+ * change of the state by the user or by a Force that moves particles (a barostat), or of the parameters of a Force; one more where the first step is taken with a given
  * reference value, since that step is then taken twice; one after loading a checkpoint or a State, to compare the forces with the
  * saved ones; and the trial steps of calibrate() and of automatic step control. A monitor ForceGroupEnergy costs the energy
  * of its group on top of each. getNumForceEvaluations() counts all.
@@ -60,7 +60,7 @@ struct RunState;
  * settings and everything else that the next step depends on, and loading one brings all of it back, the settings as
  * well: a run that goes on from a checkpoint is the same to the last bit on the Reference platform, and from a State to
  * rounding. At the first step after that the forces are computed once more. If they are not those of the saved run,
- * because a Force has been changed in the meantime, or if a State's positions, velocities, box vectors or parameters are not the
+ * because a Force has been changed in the meantime, or if a State's positions, velocities or box vectors are not the
  * Context's, the run starts afresh with the saved reference values. States and checkpoints that were written under another integrator load
  * as well: positions, velocities, time and parameters are taken, the settings stay as they are, and the run starts
  * afresh.
@@ -379,9 +379,14 @@ public:
     void getExpressionConstraintParameters(int index, std::string& expression, std::vector<int>& particles,
                                            std::map<std::string, double>& parameters) const;
     /**
-     * Change a constraint. New values of its parameters are in force at the next step, which starts the run afresh from positions
-     * that satisfy the constraint; another expression, other particles or other names take effect with
-     * Context::reinitialize(), as for addConstraint().
+     * Change a constraint. New values of its parameters are met by the next step, which moves the particles there: its end satisfies the
+     * constraint, with velocities v that belong to the motion, dg/dq v = -dg/dparameter (new - old)/(size of the step). It costs no
+     * evaluation of the forces, and the step density goes on. The work that the motion does on the particles is the multiplier times
+     * dg/dparameter times the change of the parameter; take the mean of the multipliers before and after the step. A change that no step
+     * can make fails as a step, and the value stays as it was set. Before the first step after the user has set positions or
+     * velocities, numbers that are asked for are those of particles put on the constraint, without a motion.
+     *
+     * Another expression, other particles or other names take effect with Context::reinitialize(), as for addConstraint().
      *
      * @param index         the index of the constraint
      * @param expression    the expression

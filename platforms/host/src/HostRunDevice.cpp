@@ -147,6 +147,11 @@ unsigned long long HostRunDevice::getFingerprint() {
         }
     for (int i = 0; i < 3; i++)
         fingerprint.add(vectors->getBoxVectors()[i]);
+    return fingerprint.get();
+}
+
+unsigned long long HostRunDevice::getParameterFingerprint() {
+    Fingerprint fingerprint;
     for (const auto& parameter : context.getParameters()) {
         fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
         fingerprint.add(parameter.second);
@@ -157,10 +162,13 @@ unsigned long long HostRunDevice::getFingerprint() {
 void HostRunDevice::start() {
     const Vec3* box = vectors->getBoxVectors();
     const bool hasBox = hasPeriodicBox(context.getSystem(), box);
-    requireSoundStart(dynamics->getConstraintSystem(),
-                      {vectors->getPositions(), vectors->getVelocities(), isVirtualSite, hasBox ? box : nullptr});
     const Vectors before = vectors->getPositions();
+    const VRattleDynamics::Kept kept = dynamics->keep();
     try {
+        dynamics->adoptParameters();
+        requireSoundStart(dynamics->getConstraintSystem(),
+                          {vectors->getPositions(), vectors->getVelocities(), isVirtualSite, hasBox ? box : nullptr,
+                           dynamics->getParameters()});
         context.computeVirtualSites(); // setPositions() leaves them where the user puts them
         context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
         Vectors positions = vectors->getPositions(), forces;
@@ -170,6 +178,7 @@ void HostRunDevice::start() {
     }
     catch (...) {
         vectors->setPositions(before);
+        dynamics->putBack(kept);
         throw;
     }
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
@@ -194,6 +203,12 @@ void HostRunDevice::writeVelocities() {
     writeMovingVelocities(dynamics->getVelocities());
     if (ahead != nullptr)
         ahead->velocities = vectors->getVelocities();
+}
+
+void HostRunDevice::changeForces() {
+    Vectors forces;
+    const double energy = computeForcesAt(dynamics->getPositions(), forces);
+    dynamics->changeForces(forces, energy);
 }
 
 // The forces at positions that may not be those of the Context, which keeps its own; returns the energy of the monitor's group.
@@ -450,6 +465,8 @@ void HostRunDevice::save(RunState& run) {
     run.halfStepVelocities = memory.halfStepVelocities;
     run.methodValues = {{"hasDensity", {(double) memory.hasDensity}},
                         {"density", {memory.density}},
+                        {"parameters", memory.parameters},
+                        {"parameterRates", memory.parameterRates},
                         {"multiplierOffset", memory.multiplierOffset},
                         {"multipliers", memory.multipliers},
                         {"monitorValues", memory.monitorValues},
@@ -480,11 +497,14 @@ void HostRunDevice::save(RunState& run) {
 }
 
 VRattleDynamics::Memory HostRunDevice::memoryOf(const RunState& run, const IntegratorSettings& saved) const {
-    const size_t numConstraints = dynamics->getConstraintSystem().getNumConstraints();
+    const ConstraintSystem& system = dynamics->getConstraintSystem();
+    const size_t numConstraints = system.getNumConstraints(), numParameters = system.getNumParameters();
     VRattleDynamics::Memory memory = {};
     memory.hasDensity = run.getMethodValue("hasDensity") != 0;
     memory.density = run.getMethodValue("density");
     memory.halfStepVelocities = run.halfStepVelocities;
+    memory.parameters = run.getMethodValues("parameters", numParameters);
+    memory.parameterRates = run.getMethodValues("parameterRates", numParameters);
     memory.multiplierOffset = run.getMethodValues("multiplierOffset", numConstraints);
     memory.references = run.references;
     memory.multipliers = run.getMethodValues("multipliers", numConstraints);
@@ -511,11 +531,13 @@ bool HostRunDevice::canResume(const RunState& run, const IntegratorSettings& sav
     return true;
 }
 
-bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved) {
+bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     const Vectors& positions = run.positions.empty() ? vectors->getPositions() : run.positions;
     const Vectors& velocities = run.velocities.empty() ? vectors->getVelocities() : run.velocities;
-    Vectors forces;
-    const double energy = computeForcesAt(positions, forces);
+    Vectors forces = run.forces;
+    double energy = run.groupEnergy;
+    if (!areForcesOthers)
+        energy = computeForcesAt(positions, forces);
     const double larger = std::max(std::fabs(energy), std::fabs(run.groupEnergy));
     if (!agree(forces, run.forces) || !(std::fabs(energy - run.groupEnergy) <= FORCE_ROUNDING * larger))
         return false;

@@ -33,10 +33,12 @@ public:
     bool updateState() override;
     Change findChange() override;
     unsigned long long getFingerprint() override;
+    unsigned long long getParameterFingerprint() override;
     void start() override;
     void changeState() override;
     void changeVelocities() override;
     void writeVelocities() override;
+    void changeForces() override;
     bool hasStarted() override;
     void step(double maxTime) override;
     void settle() override;
@@ -59,7 +61,7 @@ public:
     void undoStartDensities() override;
     void save(RunState& run) override;
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
-    bool resume(const RunState& run, const IntegratorSettings& saved) override;
+    bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
     typedef std::vector<OpenMM::Vec3> Vectors;

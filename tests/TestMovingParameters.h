@@ -1,0 +1,252 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Parameters of constraints and of Forces that change from step to step. Each platform's tests/ includes this file and its own setup.
+
+#include "TestExpressionConstraints.h"
+#include "openmm/HarmonicBondForce.h"
+
+namespace OpenMMVRattle {
+
+// The pendulum, with a field whose strength is a parameter.
+inline void makePendulumInField(TestSystem& t) {
+    makeSphericalPendulum(t);
+    CustomExternalForce* field = new CustomExternalForce("field*x^2");
+    field->addGlobalParameter("field", 5.0);
+    field->addParticle(1);
+    t.system.addForce(field);
+}
+
+struct MovingRun {
+    TestSystem system;
+    Integrator_ integrator;
+    std::unique_ptr<Context> context;
+    int count = 0;
+
+    explicit MovingRun(const std::function<void(Integrator_&)>& choose) : integrator(0.004) {
+        makePendulumInField(system);
+        integrator.setConstraintTolerance(1e-11);
+        integrator.addConstraint(SPHERE, {1, 0}, {{"r", 1.0}});
+        choose(integrator);
+        context.reset(new Context(system.system, integrator, getTestPlatform()));
+        start(*context, system);
+        integrator.step(1);
+    }
+    double radius() const {
+        return 1 - 0.002 * count;
+    }
+    void moveConstraint() {
+        count++;
+        integrator.setExpressionConstraintParameter(0, "r", radius());
+    }
+    void moveField() {
+        context->setParameter("field", 5 + std::sin(0.1 * count));
+    }
+    void step(int steps) {
+        for (int i = 0; i < steps; i++) {
+            moveConstraint();
+            moveField();
+            integrator.step(1);
+        }
+    }
+    double energy() const {
+        const State state = context->getState(State::Energy);
+        return state.getKineticEnergy() + state.getPotentialEnergy();
+    }
+    double potential() const {
+        return context->getState(State::Energy).getPotentialEnergy();
+    }
+    vector<double> numbers() {
+        return Trace(*context, integrator, 0).numbers;
+    }
+};
+
+inline std::vector<std::pair<std::string, std::function<void(Integrator_&)>>> allChoices() {
+    auto monitor = [](Integrator_::UpdateMethod update) {
+        return [update](Integrator_& integrator) {
+            integrator.clearMonitors();
+            integrator.addMonitor(Integrator_::ConstraintAndAppliedForce);
+            integrator.setUpdateMethod(update);
+        };
+    };
+    return {{"fixed", [](Integrator_& integrator) { integrator.clearMonitors(); }},
+            {"SemiExplicit", monitor(Integrator_::SemiExplicit)},
+            {"Explicit", monitor(Integrator_::Explicit)},
+            {"Bounded", monitor(Integrator_::Bounded)},
+            {"automatic", [](Integrator_& integrator) { integrator.useAutomaticStepControl(50); }}};
+}
+
+// Both change in each step: what it costs, and that energy is what was put in.
+inline void testCostAndBalance() {
+    for (const auto& choice : allChoices()) {
+        MovingRun run(choice.second);
+        long long evaluations = run.integrator.getNumForceEvaluations();
+        for (int i = 0; i < 50; i++) {
+            run.moveConstraint();
+            run.integrator.step(1);
+        }
+        ASSERT_EQUAL(evaluations + 50, run.integrator.getNumForceEvaluations());
+        evaluations += 50;
+        // What the multiplier does not pay for is the kinetic energy along the constraint, where the rate changes: it is the
+        // same number of nm a step, whatever the size of the step.
+        auto energyWithout = [&] {
+            const double rate = 0.002 / run.integrator.getStepSize();
+            return run.energy() - rate * rate;
+        };
+        const double first = energyWithout();
+        double work = 0;
+        for (int i = 0; i < 100; i++) {
+            const double radius = run.radius(), force = -run.integrator.getExpressionConstraintMultiplier(0);
+            const double before = run.potential();
+            run.moveField();
+            work += run.potential() - before;
+            run.moveConstraint();
+            run.integrator.step(1);
+            work += 0.5 * (force - run.integrator.getExpressionConstraintMultiplier(0)) * (run.radius() - radius);
+            // On the constraint, and with its velocity.
+            const State state = run.context->getState(State::Positions | State::Velocities);
+            const Vec3 r = state.getPositions()[1] - state.getPositions()[0], v = state.getVelocities()[1];
+            ASSERT_EQUAL_TOL(run.radius(), std::sqrt(r.dot(r)), 1e-9);
+            ASSERT(std::fabs(r.dot(v) / run.radius() + 0.002 / run.integrator.getStepSize()) < 1e-5);
+        }
+        ASSERT_EQUAL(evaluations + 200, run.integrator.getNumForceEvaluations());
+        ASSERT(std::fabs(energyWithout() - first - work) < 0.01 * std::fabs(work));
+        ASSERT(std::fabs(work) > 1);
+    }
+}
+
+// The monitor of half steps of automatic step control is of the forces as they are along the step.
+inline void testMonitorAfterJumpOfForce() {
+    System system;
+    system.addParticle(10);
+    CustomExternalForce* pull = new CustomExternalForce("f*x");
+    pull->addGlobalParameter("f", 1.0);
+    pull->addParticle(0);
+    system.addForce(pull);
+    Integrator_ integrator(0.002);
+    integrator.useAutomaticStepControl(10);
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions({Vec3()});
+    context.setVelocities({Vec3(1, 0, 0)});
+    integrator.step(10);
+    ASSERT_EQUAL_TOL(1 / std::sqrt(10.0), integrator.getMonitorValue(1), 1e-4);
+    context.setParameter("f", 3.0);
+    integrator.step(1);
+    ASSERT_EQUAL_TOL(3 / std::sqrt(10.0), integrator.getMonitorValue(1), 1e-4);
+}
+
+// A Force that is changed by updateParametersInContext().
+inline void testUpdatedForce() {
+    System system;
+    for (int i = 0; i < 3; i++)
+        system.addParticle(12);
+    system.addConstraint(0, 1, 0.2);
+    HarmonicBondForce* bond = new HarmonicBondForce();
+    bond->addBond(1, 2, 0.2, 1000);
+    system.addForce(bond);
+    Integrator_ integrator(0.002);
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions({Vec3(), Vec3(0.2, 0, 0), Vec3(0.25, 0.2, 0)});
+    context.setVelocities({Vec3(), Vec3(0, 1, 0), Vec3(1, 0, 0)});
+    integrator.step(1);
+    const long long before = integrator.getNumForceEvaluations();
+    for (int i = 0; i < 20; i++) {
+        bond->setBondParameters(0, 1, 2, 0.2, 1000 + 10 * i);
+        bond->updateParametersInContext(context);
+        integrator.step(1);
+    }
+    ASSERT_EQUAL(before + 40, integrator.getNumForceEvaluations());
+}
+
+// Saved in the middle, with changes that have not been met yet or without.
+inline void testSavedInTheMiddle() {
+    for (const auto& choice : allChoices())
+        for (int pending = 0; pending < 4; pending++) {
+            MovingRun run(choice.second), byCheckpoint(choice.second), byState(choice.second);
+            run.step(10);
+            if (pending & 1)
+                run.moveConstraint();
+            if (pending & 2)
+                run.moveField();
+            const std::string checkpoint = checkpointOf(*run.context);
+            const State state = run.context->getState(WHOLE_STATE);
+            loadCheckpoint(*byCheckpoint.context, checkpoint);
+            byState.context->setState(state);
+            for (MovingRun* each : {&run, &byCheckpoint, &byState}) {
+                each->count = run.count;
+                if (pending != 0)
+                    each->integrator.step(1);
+            }
+            for (MovingRun* each : {&run, &byCheckpoint, &byState})
+                each->step(10);
+            ASSERT(run.numbers() == byCheckpoint.numbers());
+            ASSERT(run.numbers() == byState.numbers());
+        }
+}
+
+// A trial run in between stands still, and leaves what is to come as it was.
+inline void testTrialRunInBetween() {
+    MovingRun run(allChoices()[0].second), other(allChoices()[0].second);
+    run.step(10);
+    other.step(10);
+    run.moveConstraint();
+    other.moveConstraint();
+    other.integrator.useAutomaticStepControl(30);
+    other.integrator.calibrate(20);
+    allChoices()[0].second(other.integrator);
+    run.integrator.step(3);
+    other.integrator.step(3);
+    const double expected = run.energy();
+    ASSERT_EQUAL_TOL(expected, other.energy(), 1e-9);
+    const Vec3 r = other.context->getState(State::Positions).getPositions()[1] - other.system.positions[0];
+    ASSERT_EQUAL_TOL(other.radius(), std::sqrt(r.dot(r)), 1e-9);
+}
+
+// A jump that no step can make.
+inline void testTooLargeJump() {
+    for (const auto& choice : allChoices()) {
+        MovingRun run(choice.second), other(choice.second);
+        for (int i = 0; i < 5; i++) {
+            run.step(3);
+            other.step(3);
+            const vector<double> before = other.numbers();
+            other.integrator.setExpressionConstraintParameter(0, "r", -0.5);
+            for (int attempt = 0; attempt < 2; attempt++) {
+                assertThrows("move them by less at a time", [&] { other.integrator.step(1); });
+                ASSERT(before == other.numbers());
+            }
+            std::string expression;
+            vector<int> particles;
+            std::map<std::string, double> parameters;
+            other.integrator.getExpressionConstraintParameters(0, expression, particles, parameters);
+            ASSERT_EQUAL(-0.5, parameters.at("r"));
+        }
+        run.step(3);
+        other.step(3);
+        ASSERT(run.numbers() == other.numbers());
+    }
+}
+
+// To equal times, with a parameter that changes at each.
+inline void testStepToWhileMoving() {
+    for (const auto& choice : allChoices()) {
+        MovingRun run(choice.second);
+        const double start = run.context->getTime();
+        const Vec3 momentum = [&] {
+            const State state = run.context->getState(State::Positions | State::Velocities);
+            return (state.getPositions()[1] - state.getPositions()[0]).cross(state.getVelocities()[1]);
+        }();
+        run.context->setParameter("field", 0.0); // then the moment about the vertical axis is conserved
+        for (int i = 1; i <= 200; i++) {
+            run.moveConstraint();
+            run.integrator.stepTo(start + 0.003 * i);
+            ASSERT_EQUAL(start + 0.003 * i, run.context->getTime());
+        }
+        const State state = run.context->getState(State::Positions | State::Velocities);
+        const Vec3 r = state.getPositions()[1] - state.getPositions()[0];
+        ASSERT_EQUAL_TOL(run.radius(), std::sqrt(r.dot(r)), 1e-9);
+        ASSERT_EQUAL_TOL(momentum[2], r.cross(state.getVelocities()[1])[2], 1e-3);
+    }
+}
+
+} // namespace OpenMMVRattle
