@@ -46,10 +46,10 @@ nb_execution_raise_on_error = True
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(openmm|unit|app|numpy|np|matplotlib|collections|os|pathlib|typing|rich|pandas)(\..*)?"),
-    ("py:.*", r"(Any|Path|Callable|Sequence|Iterator|Figure|Quantity|OpenMMException)"),
+    ("py:.*", r"(Any|Path|Callable|Sequence|Iterator|Figure|Context|Quantity|OpenMMException)"),
     ("py:.*", r"(Custom|Compound|Verlet|VariableVerlet)?Integrator"),
     ("py:.*", r"(bool|dict|float|int|list|None|object|str|tuple|type|TypeError|ValueError|optional)"),
-    ("cpp:.*", r"(OpenMM|std)(::.*)?|string|vector|size_t"),
+    ("cpp:.*", r"(OpenMM|std)(::.*)?|string|vector|size_t|osrngseed"),
 ]
 
 autodoc_member_order = "bysource"

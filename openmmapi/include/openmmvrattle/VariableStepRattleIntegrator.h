@@ -339,6 +339,12 @@ public:
     void setConstraintTolerance(double tol) override;
     /** Get the force groups that act, a bit for each: those that were set, without that of a monitor ForceGroupEnergy. */
     int getIntegrationForceGroups() const override;
+    /**
+     * Set which force groups to use for integration. Whether that of a monitor ForceGroupEnergy is among them is of no
+     * meaning.
+     *
+     * @param groups    a set of bit flags
+     */
     void setIntegrationForceGroups(int groups) override;
     /**
      * Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm, which are
