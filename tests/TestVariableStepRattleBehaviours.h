@@ -220,9 +220,10 @@ inline void testVelocityConstraints(Integrator_::UpdateMethod update) {
         }
         ends[run++] = context.getState(State::Positions).getPositions();
     }
-    // To the tolerance of OpenMM's projection, along 0.02 ps.
+    // To the tolerance of OpenMM's projection, along 0.02 ps. Elsewhere than on Reference nonbonded forces are of single precision
+    // and change, by as much as 1e-5, where positions do by rounding: 2e-8 nm at 10 nm/ps^2, and the bar well above.
     for (size_t i = 0; i < positions.size(); i++)
-        ASSERT_EQUAL_VEC(ends[0][i], ends[1][i], 1e-9);
+        ASSERT_EQUAL_VEC(ends[0][i], ends[1][i], getTestPlatform().getName() == "Reference" ? 1e-9 : 1e-6);
 }
 
 inline void testConstrainedMasslessParticles() {
