@@ -10,6 +10,7 @@ B. Leimkuhler and S. Reich, SIAM J. Sci. Comput. 21 (1999) 1027.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -513,6 +514,33 @@ def pendulum_potential(model: Model) -> Potential:
     weight = np.zeros(9)
     weight[[4, 7]] = model.masses[1:]
     return lambda q: (float(weight @ q), weight)
+
+
+def pendulum_at(time: float, inner: float, outer: float, steps: int = 16000) -> tuple[Array, Array]:
+    """Positions and velocities of double_pendulum(inner, outer), by the classical method of order four.
+
+    From Lagrange's equations for its two angles, which know of no constraint.
+    """
+    sin, cos = math.sin, math.cos
+
+    def slope(a: float, b: float, va: float, vb: float) -> tuple[float, float, float, float]:
+        s, c = sin(a - b), cos(a - b)
+        first = -outer * s * vb * vb - (inner + outer) * sin(a)
+        second = s * va * va - sin(b)
+        pull = (first - outer * c * second) / (inner + outer * s * s)
+        return va, vb, pull, second - c * pull
+
+    state, h = (2.2, 0.5, 0.0, 0.0), time / steps
+    for _ in range(steps):
+        k1 = slope(*state)
+        k2 = slope(*(x + h / 2 * k for x, k in zip(state, k1, strict=True)))
+        k3 = slope(*(x + h / 2 * k for x, k in zip(state, k2, strict=True)))
+        k4 = slope(*(x + h * k for x, k in zip(state, k3, strict=True)))
+        state = tuple(x + h / 6 * (p + 2 * q + 2 * r + t) for x, p, q, r, t in zip(state, k1, k2, k3, k4, strict=True))
+    a, b, va, vb = state
+    bobs = np.array([[sin(a), -cos(a), 0], [sin(b), -cos(b), 0]])
+    motions = np.array([[va * cos(a), va * sin(a), 0], [vb * cos(b), vb * sin(b), 0]])
+    return np.vstack([np.zeros(3), np.cumsum(bobs, axis=0)]), np.vstack([np.zeros(3), np.cumsum(motions, axis=0)])
 
 
 def chain() -> Model:

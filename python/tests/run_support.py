@@ -109,3 +109,18 @@ def assert_same_run(
         np.testing.assert_allclose(used.getStepDensity(), fresh.getStepDensity(), rtol=max(1e-9, atol))
         np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=atol)
         np.testing.assert_allclose(velocities_of(context), velocities_of(other), rtol=0, atol=100 * atol)
+
+
+def rattle_as_custom_integrator(step: float) -> openmm.CustomIntegrator:
+    """Velocity Verlet with constraints as in OpenMM's own documentation of CustomIntegrator."""
+    integrator = openmm.CustomIntegrator(step)
+    integrator.addPerDofVariable("x1", 0)
+    integrator.addUpdateContextState()
+    integrator.addComputePerDof("v", "v+0.5*dt*f/m")
+    integrator.addComputePerDof("x", "x+dt*v")
+    integrator.addComputePerDof("x1", "x")
+    integrator.addConstrainPositions()
+    integrator.addComputePerDof("v", "v+0.5*dt*f/m+(x-x1)/dt")
+    integrator.addConstrainVelocities()
+    integrator.setConstraintTolerance(1e-12)
+    return integrator

@@ -3,7 +3,6 @@
 """The benchmarks run and write what they should, and the gains that the documentation claims are there."""
 
 import csv
-import importlib.util
 import json
 import math
 import subprocess
@@ -11,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from project_scripts import load_script
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "work_precision.py"
 DOCUMENT = Path(__file__).parents[2] / "docs" / "work_precision.md"
@@ -32,11 +32,7 @@ def lines_of(path):
 @pytest.fixture(scope="module")
 def script():
     """The script as a module."""
-    specification = importlib.util.spec_from_file_location("work_precision", SCRIPT)
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module
-    specification.loader.exec_module(module)
-    return module
+    return load_script("benchmarks/work_precision.py")
 
 
 @pytest.fixture(scope="module")

@@ -4,27 +4,18 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
-
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "drift.py"
+from project_scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def drift() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("drift", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Where dataclasses look up the module of a class.
-    sys.modules["drift"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script("benchmarks/drift.py")
 
 
 def test_drift_and_walk_of_known_series(drift: ModuleType) -> None:

@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import json
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -16,21 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-PATH = Path(__file__).resolve().parents[2] / "examples" / "double_pendulum.py"
+from project_scripts import load_script
 
 
 @pytest.fixture(scope="module")
-def example() -> Iterator[ModuleType]:
+def example() -> ModuleType:
     """The script as a module."""
-    name = "example_double_pendulum"
-    specification = importlib.util.spec_from_file_location(name, PATH)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # dataclasses look their module up
-    specification.loader.exec_module(module)
-    yield module
-    del sys.modules[name]
+    return load_script("examples/double_pendulum.py")
 
 
 @pytest.fixture(scope="module")

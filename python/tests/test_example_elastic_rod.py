@@ -4,12 +4,9 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import json
 import math
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,21 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 from dense_rod import Rod
-
-PATH = Path(__file__).resolve().parents[2] / "examples" / "elastic_rod.py"
+from project_scripts import load_script
 
 
 @pytest.fixture(scope="module")
-def example() -> Iterator[ModuleType]:
+def example() -> ModuleType:
     """The script as a module."""
-    name = "example_elastic_rod"
-    specification = importlib.util.spec_from_file_location(name, PATH)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # dataclasses look their module up
-    specification.loader.exec_module(module)
-    yield module
-    del sys.modules[name]
+    return load_script("examples/elastic_rod.py")
 
 
 @pytest.fixture(scope="module")

@@ -22,18 +22,7 @@ from dense_reference import (
 )
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
-
-BOLTZMANN = 0.00831446261815324
-
-
-def make_integrator(step: float = 0.0005, kind: str | None = None, **settings: Any) -> VariableStepRattleIntegrator:
-    integrator = VariableStepRattleIntegrator(step)
-    if kind is not None:
-        integrator.clearMonitors()
-        integrator.addMonitor(getattr(VariableStepRattleIntegrator, kind))
-    for name, setting in settings.items():
-        getattr(integrator, name)(setting)
-    return integrator
+from run_support import BOLTZMANN, fastest_platform, make_integrator, rattle_as_custom_integrator
 
 
 @pytest.fixture(scope="module")
@@ -45,17 +34,13 @@ def water_box() -> tuple[app.Topology, Any, app.ForceField]:
     system = force_field.createSystem(modeller.topology, nonbondedMethod=app.CutoffPeriodic, nonbondedCutoff=0.7)
     integrator = openmm.LangevinMiddleIntegrator(300, 10, 0.002)
     integrator.setRandomNumberSeed(5)
-    platform = "CPU" if has_platform("CPU") else "Reference"
+    platform = fastest_platform()
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
     context.setPositions(modeller.positions)
     openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
     context.setVelocitiesToTemperature(300, 6)
     integrator.step(500)
     return modeller.topology, positions_of(context), force_field
-
-
-def has_platform(name: str) -> bool:
-    return name in {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
 
 
 @pytest.mark.parametrize("method", [app.CutoffPeriodic, app.PME])
@@ -218,7 +203,7 @@ def test_centre_of_mass_motion_remover(platform: str) -> None:
 
 
 def test_barostat(water_box: tuple[Any, Any, Any]) -> None:
-    platform = "CPU" if has_platform("CPU") else "Reference"
+    platform = fastest_platform()
     topology, positions, force_field = water_box
     # High pressure, so that the volume goes down beyond doubt.
     system = force_field.createSystem(topology, nonbondedMethod=app.CutoffPeriodic, nonbondedCutoff=0.6)
@@ -499,21 +484,6 @@ def test_calibrate(platform: str) -> None:
     k = 0.5 / 49
     expected = 0.0005 / ((0.5 + 50 * k * u) / (1 + k * u))
     assert value(integrator.getStepSize()) == pytest.approx(expected, rel=0.05)
-
-
-def rattle_as_custom_integrator(step: float) -> openmm.CustomIntegrator:
-    """Velocity Verlet with constraints as in OpenMM's own documentation of CustomIntegrator."""
-    integrator = openmm.CustomIntegrator(step)
-    integrator.addPerDofVariable("x1", 0)
-    integrator.addUpdateContextState()
-    integrator.addComputePerDof("v", "v+0.5*dt*f/m")
-    integrator.addComputePerDof("x", "x+dt*v")
-    integrator.addComputePerDof("x1", "x")
-    integrator.addConstrainPositions()
-    integrator.addComputePerDof("v", "v+0.5*dt*f/m+(x-x1)/dt")
-    integrator.addConstrainVelocities()
-    integrator.setConstraintTolerance(1e-12)
-    return integrator
 
 
 @pytest.mark.parametrize("make", [waters, chain])

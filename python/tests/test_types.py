@@ -42,10 +42,12 @@ text: str = integrator.getStepDensity()
 """
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "mypy.ini").write_text(CONFIGURATION)
-    return tmp_path
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One for all, so that mypy finds again what it knows of the package."""
+    result = tmp_path_factory.mktemp("types")
+    (result / "mypy.ini").write_text(CONFIGURATION)
+    return result
 
 
 def mypy(folder: Path, script: str) -> tuple[int, str]:

@@ -28,8 +28,8 @@ from dense_reference import (
 )
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
-from test_equations import check_equations, record
-from test_openmm_behaviour import rattle_as_custom_integrator
+from recorded_run import check_equations, record
+from run_support import rattle_as_custom_integrator
 
 pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
 
