@@ -281,12 +281,12 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         """Get the number of monitors."""
         return int(self._get("monitors"))
 
-    def getMonitor(self, index: int) -> list[Any]:
+    def getMonitor(self, index: int) -> tuple[int, float, float]:
         """Get kind, weight and power of a monitor."""
         monitor = self._settings().monitors[self._monitor_index(index)]
         if monitor.is_default and self._get("applies"):
-            return [self.ConstraintAndAppliedForce, monitor.weight, monitor.power]
-        return [monitor.kind, monitor.weight, monitor.power]
+            return self.ConstraintAndAppliedForce, monitor.weight, monitor.power
+        return monitor.kind, monitor.weight, monitor.power
 
     def getMonitorForceGroup(self) -> int:
         """Get the force group whose energy the monitor ForceGroupEnergy uses."""
