@@ -16,6 +16,7 @@ import numpy as np
 import openmm
 import pytest
 from dense_reference import chain, open_context, positions_of, time_of, value, velocities_of
+from openmmvrattle import ConstraintWarning
 from openmmvrattle import CustomVariableStepRattleIntegrator as Custom
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain
 
@@ -213,6 +214,21 @@ def test_lost_constraints_leave_the_last_state_that_met_them(act: str) -> None:
         np.testing.assert_array_equal(*seen)
         for integrator, _ in runs:
             integrator.step(1)
+
+
+def test_a_warning_that_is_raised_leaves_the_steps_that_were_taken() -> None:
+    """As docs/custom.md has it, to stop at the first one."""
+    runs = [whip(), whip()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ConstraintWarning)
+        with pytest.raises(ConstraintWarning):
+            runs[0][0].step(100_000)
+        steps = runs[0][1].getStepCount()
+        warnings.simplefilter("ignore", ConstraintWarning)
+        runs[1][0].step(steps)
+    assert 0 < steps < 10_000
+    np.testing.assert_array_equal(positions_of(runs[0][1]), positions_of(runs[1][1]))
+    assert time_of(runs[0][1]) == time_of(runs[1][1])
 
 
 def test_a_setting_that_was_changed_stays_when_constraints_are_lost() -> None:

@@ -730,7 +730,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
     def _advance(self, run: Run, steps: int) -> None:
         """Take steps, the first of which may be a first one of a sequence of densities."""
-        context, before, taken = run.context, None, 0
+        context, before, unseen = run.context, None, steps
         self._fit_tolerances(run)
         is_start = not self._get("started")
         if is_start or run.keeps_variables:
@@ -739,20 +739,22 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             if is_start:
                 self._apply_constraints(context)
             self._take(context)
-            if self._get("fresh"):
+            is_fresh = bool(self._get("fresh"))
+            if is_fresh:
                 self._improve_start(run)
-                run.begin()
-                self._check(run, 1)
-                taken = 1
         except BaseException:
             if before is not None:
                 context.setPositions(before[0])
                 context.setVelocities(before[1])
             raise
+        if is_fresh:
+            run.begin()
+            self._check(run, 1)
+            unseen -= 1
         if steps > 1:
             self._take(context, steps - 1)
-        if steps > taken:
-            self._check(run, steps - taken)
+        if unseen:
+            self._check(run, unseen)
 
     def _apply_constraints(self, context: openmm.Context) -> None:
         """Put the state onto the constraints, as at the start of every run."""
