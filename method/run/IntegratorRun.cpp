@@ -15,9 +15,8 @@ using std::vector;
 
 namespace {
 
-// Trial steps of automatic step control: how often they are made shorter, and the ratio of densities from which on they are.
+// How often the trial steps of automatic step control are made shorter.
 const int MAX_HALVINGS = 8;
-const double START_ACCURACY = 1.1;
 
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
@@ -183,7 +182,6 @@ void IntegratorRun::prepare(bool areForcesInvalid, bool isForStep) {
 void IntegratorRun::askForStep(double maxTime) {
     takeSaved(); // as long as no Force has changed the Context
     prepare(device.updateState(), true);
-    startAutomatic();
     device.step(maxTime);
     isAtStart = areParametersNew = false;
     toldSize.reset();
@@ -203,15 +201,9 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
             toldSize = size;
             toldDensity = density;
         }
-        undoStart();
         throwFailure("the step", device.getTime(), failure.what(),
                      "; the Context is in the state before this step: use a smaller step size, or another monitor");
     }
-    catch (...) {
-        undoStart();
-        throw;
-    }
-    beforeStart.reset();
 }
 
 void IntegratorRun::step(int count) {
@@ -234,18 +226,11 @@ void IntegratorRun::reverse() {
     requireStepSize();
     prepare(false);
     try {
-        startAutomatic();
         device.reverse();
     }
     catch (const StepFailure& failure) {
-        undoStart();
         throwFailure("reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
     }
-    catch (...) {
-        undoStart();
-        throw;
-    }
-    beforeStart.reset();
     toldDensity.reset();
 }
 
@@ -281,51 +266,24 @@ vector<double> IntegratorRun::calibrate(int steps) {
     return means;
 }
 
-// Start automatic step control, if the run is not in the middle of a sequence of its steps.
-void IntegratorRun::startAutomatic() {
-    if (!settings.isAutomatic || device.hasStarted())
-        return;
-    const vector<double> given = device.getReferences();
-    beforeStart = BeforeStart{given, device.getStepCount()};
-    if (std::any_of(given.begin(), given.end(), [](double reference) { return !(reference > 0); })) {
-        vector<double> references = findAutomaticReferences(settings.calibrationSteps);
-        for (size_t k = 0; k < references.size(); k++)
-            if (given[k] > 0) // set by the user
-                references[k] = given[k];
-        device.setReferences(references);
-    }
-    startFromTrialSteps();
-}
-
-// Forget what automatic step control has started with, if the first step after that has failed or has never been tried.
-void IntegratorRun::undoStart() {
-    if (beforeStart && device.getStepCount() == beforeStart->stepCount) {
-        device.undoStartDensities();
-        device.setReferences(beforeStart->references);
-    }
-    beforeStart.reset();
-}
-
 // The geometric means of the two monitors over a trial run of fixed steps. Where steps of the nominal size fail, shorter ones
 // must do.
 vector<double> IntegratorRun::findAutomaticReferences(int steps) {
     double stepSize = settings.stepSize;
     for (int halvings = 0;; halvings++) {
         vector<double> logarithms(AutomaticControl::NUM_MONITORS, 0.0);
-        double floor = 0; // the logarithm of what is zero but for rounding
+        const double negligible = device.getNegligibleValue();
         try {
             Trial trial(device, stepSize, false);
             for (int i = 0; i < steps; i++) {
                 const vector<double> values = trial.step();
-                const double negligible = device.getNegligibleValue();
-                floor += std::log(negligible) / steps;
                 for (size_t k = 0; k < logarithms.size(); k++)
                     logarithms[k] += std::log(std::max(values[k], negligible)) / steps;
             }
         }
         catch (const StepFailure& failure) {
             if (halvings == MAX_HALVINGS)
-                throwFailure("the trial run of automatic step control", device.getTime(), failure.what(),
+                throwFailure("calibrate()", device.getTime(), failure.what(),
                              "; the Context is unchanged: use a smaller step size");
             stepSize *= 0.5;
             continue;
@@ -333,41 +291,13 @@ vector<double> IntegratorRun::findAutomaticReferences(int steps) {
         vector<double> references;
         for (double logarithm : logarithms) {
             references.push_back(std::exp(logarithm));
-            if (!(references.back() > 0) || !(logarithm > floor + std::log(10)))
-                throw OpenMMException("VariableStepRattleIntegrator: in the trial run of the automatic step control "
-                                      "there is no force and nothing turns, so there is nothing to measure steps by; "
-                                      "take more trial steps with useAutomaticStepControl(), until something happens, "
-                                      "or call clearMonitors() for fixed steps");
+            if (!(references.back() > 2 * negligible))
+                throw OpenMMException(
+                    "VariableStepRattleIntegrator: in the trial run of calibrate() there is no force and "
+                    "nothing moves, so there is nothing to measure steps by; leave it to the run, which "
+                    "finds the reference values as soon as there is something");
         }
         return references;
-    }
-}
-
-// Two trial steps backwards start the sequences of densities. Their size is that of the first step, which only they tell.
-void IntegratorRun::startFromTrialSteps() {
-    const vector<double> start = device.getMonitorValues();
-    double density = device.densityOf({start[0], 0.0});
-    for (int tries = 0;; tries++) {
-        vector<double> back, secondBack;
-        try {
-            Trial trial(device, settings.stepSize / density, true);
-            back = trial.step();
-            const double found = device.densityOf({start[0], back[1]});
-            if (found > START_ACCURACY * density && tries < MAX_HALVINGS) {
-                density = found;
-                continue;
-            }
-            secondBack = trial.step();
-        }
-        catch (const StepFailure& failure) {
-            if (tries >= MAX_HALVINGS)
-                throwFailure("the start of automatic step control", device.getTime(), failure.what(),
-                             "; the Context is unchanged: use a smaller step size");
-            density *= 2;
-            continue;
-        }
-        device.startDensities(back, secondBack);
-        return;
     }
 }
 

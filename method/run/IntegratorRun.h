@@ -84,10 +84,7 @@ private:
     std::vector<double> getReferences();
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);
-    void startAutomatic();
-    void undoStart();
     std::vector<double> findAutomaticReferences(int steps);
-    void startFromTrialSteps();
     RunDevice& device;
     const IntegratorSettings& settings;
     IntegratorSettings applied; // those that the device has
@@ -99,12 +96,6 @@ private:
     bool areForcesChanged; // since the last step; of no interest where the task computes them anyway
     Task task;
     std::unique_ptr<RunState> saved; // to go on from, until it is known whether the Context is in its state
-    /** What there was before automatic step control started, as long as no step has been taken since. */
-    struct BeforeStart {
-        std::vector<double> references;
-        long long stepCount;
-    };
-    std::optional<BeforeStart> beforeStart;
     // What is to be said of the last step, where the device does not know it.
     std::optional<double> toldSize, toldDensity;
 };

@@ -14,6 +14,7 @@ namespace {
 // The bounds' defaults as fractions of the nominal step size.
 const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
 const double DEFAULT_MAXIMUM_FACTOR = 2.0;
+const double AUTOMATIC_MINIMUM_FACTOR = 1e-3; // of automatic step control
 
 } // namespace
 
@@ -22,7 +23,8 @@ IntegratorSettings::IntegratorSettings(double stepSize) : stepSize(stepSize) {
 }
 
 double IntegratorSettings::getMinimumStep() const {
-    return minimumStep == USE_DEFAULT ? DEFAULT_MINIMUM_FACTOR * stepSize : minimumStep;
+    const double factor = isAutomatic ? AUTOMATIC_MINIMUM_FACTOR : DEFAULT_MINIMUM_FACTOR;
+    return minimumStep == USE_DEFAULT ? factor * stepSize : minimumStep;
 }
 
 double IntegratorSettings::getMaximumStep() const {
@@ -45,7 +47,7 @@ void IntegratorSettings::fitDefaultMonitor(bool hasConstraints) {
 
 bool IntegratorSettings::isConsistent() const {
     const double minimum = getMinimumStep(), maximum = getMaximumStep();
-    return isAutomatic || stepSize == 0 || (minimum < stepSize && (maximum == 0 || stepSize < maximum));
+    return stepSize == 0 || (minimum < stepSize && (isAutomatic || maximum == 0 || stepSize < maximum));
 }
 
 void IntegratorSettings::requireConsistent() const {
@@ -53,8 +55,10 @@ void IntegratorSettings::requireConsistent() const {
         return;
     std::stringstream message;
     message << "VariableStepRattleIntegrator: the minimum step size (" << getMinimumStep()
-            << " ps) must be smaller than the nominal one (" << stepSize << " ps), and the maximum step size ("
-            << getMaximumStep() << " ps) larger than the nominal one, or 0 for no bound";
+            << " ps) must be smaller than the nominal one (" << stepSize << " ps)";
+    if (!isAutomatic)
+        message << ", and the maximum step size (" << getMaximumStep()
+                << " ps) larger than the nominal one, or 0 for no bound";
     throw OpenMMException(message.str());
 }
 

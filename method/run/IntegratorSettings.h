@@ -19,7 +19,7 @@ namespace OpenMMVRattle {
 struct IntegratorSettings {
     static constexpr double USE_DEFAULT = -1;
     static constexpr double DEFAULT_NORM_ORDER = 8;
-    static constexpr int DEFAULT_CALIBRATION_STEPS = 300;
+    static constexpr int DEFAULT_CALIBRATION_STEPS = 30;
 
     double stepSize = 0;               // the nominal step (ps); 0 where no step is to be taken
     double minimumStep = USE_DEFAULT;  // bounds (ps), 0 for none; see getMinimumStep()
@@ -34,7 +34,7 @@ struct IntegratorSettings {
     int monitorForceGroup = 31;
     double normOrder = DEFAULT_NORM_ORDER; // of monitors that are added without one
 
-    // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
+    // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
     bool isAutomatic = false;
     int calibrationSteps = DEFAULT_CALIBRATION_STEPS;
     double automaticReferences[AutomaticControl::NUM_MONITORS] = {};

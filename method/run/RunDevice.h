@@ -103,8 +103,6 @@ public:
 
     // ----------------------------------------------------------------------------------------------------- the steps
 
-    /** Whether the next step continues a sequence of densities; if not, it is a first one. */
-    virtual bool hasStarted() = 0;
     /**
      * Take one step: (3.9)-(3.11) and (3.14), virtual sites, time and step count of its end, the forces there, (3.12)-(3.13).
      * A first step that has to be taken twice is (see VRattleDynamics::finish()). May only ask for it, see above.
@@ -162,19 +160,12 @@ public:
 
     // ---------------------------------------------------------------------------------------- automatic step control
 
-    /** A value of its monitors below this is zero but for rounding, at the velocities of the method's state. */
+    /** A value of its monitors that is no more than this is nothing but rounding. */
     virtual double getNegligibleValue() = 0;
-    /** The density that values of its monitors alone ask for. */
-    virtual double densityOf(const std::vector<double>& values) = 0;
-    /**
-     * Start the densities from two steps backwards in time; see AutomaticControl::start(). The references must be in force.
-     *
-     * @param back          U_A[-1] and U_B[-1/2]
-     * @param secondBack    U_A[-2] and U_B[-3/2]
-     */
-    virtual void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) = 0;
-    /** Undo startDensities(), since the step that it was for has failed; no other has been completed since. */
-    virtual void undoStartDensities() = 0;
+    /** The most steps in a row that were shorter than a tenth of the nominal one. */
+    virtual long long getNumShortSteps() {
+        return 0;
+    }
 
     // ------------------------------------------------------------------------------------------- saving and resuming
 

@@ -5,6 +5,7 @@
 #include "constraints/StepFailure.h"
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <string>
 
 using namespace OpenMMVRattle;
@@ -13,14 +14,35 @@ using std::vector;
 
 namespace {
 
-// The powers of u_A and u_B, the length l (nm), where the dead zone ends, and the largest density that is asked for.
+// The powers of u_A and u_B, the lengths l and l_f (nm), the weight of the change of the forces, and where the dead zone ends.
 const double POWERS[] = {2.0 / 3.0, 0.8};
-const double LENGTH = 0.0125;
-const double DEAD_ZONE = 2, LARGEST = 1000;
+const double LENGTH = 0.0125, FLIGHT = 0.4;
+const double CHANGE_WEIGHT = 3;
+const double DEAD_ZONE = 2.5;
+// Below this fraction of DEAD_ZONE the density is exactly 1, so that calm steps are those of fixed steps.
+const double EXACT_PART = 0.8;
 // a in f(x) = (x - a) - (1 - a)^2/(x - a): no step is longer than the nominal one divided by a.
 const double SMALLEST = 0.75;
-// Accelerations below this fraction of |v|^2/l are rounding.
-const double ROUNDING = 1e-12;
+// In units of the thermal momentum a step (see thermalValue()): what is hard beyond doubt, the reference then, and the least one
+// while the references follow. At rest things are measured as at 300 K (kJ/mol).
+const double HARD = 8, HARD_REFERENCE = 0.4, FOLLOWING_FLOOR = 0.2;
+const double ROOM_TEMPERATURE = 300 * 0.00831446;
+// In the same units at 300 K: what is nothing, but for rounding.
+const double NEGLIGIBLE = 1e-6;
+// The references follow the logarithms of the monitors, which count as no more than this above or below, in this number of steps.
+const double LARGEST_SURPRISE = 2, FOLLOWING_STEPS = 100;
+// They do so until so many steps have passed without a change of the state.
+const double LAST_CHANGE = 1000;
+// At a temperature higher by this factor references are found anew.
+const double MUCH_HOTTER = 4;
+// A change of the velocities by less than this fraction leaves the run that of constant energy that it was.
+const double ROUNDING = 1e-6;
+// In the first steps of a sequence the densities are drawn towards their monitors by this part of their distance a step, for what
+// the monitors were before is not known.
+const int SETTLING_STEPS = 30;
+const double SETTLING = 0.1;
+// What is a short step, in nominal ones.
+const double SHORT = 0.1;
 
 double f(double x) {
     const double one = 1 - SMALLEST;
@@ -46,11 +68,12 @@ double sixteenthRoot(double x) {
     return x;
 }
 
-// phi(u): 1 to 1e-6 for u below 0.4 DEAD_ZONE, u/DEAD_ZONE far above it, and never above LARGEST.
+// phi(u) without its upper bound: exactly 1 for u below EXACT_PART DEAD_ZONE, nearly u/DEAD_ZONE far above it.
 double applyDeadZone(double u) {
+    auto fourth = [](double x) { return (x * x) * (x * x); };
     const double x = std::min(u / DEAD_ZONE, 1e15); // whose sixteenth power does not overflow
-    const double raised = sixteenthRoot(1 + sixteenthPower(x));
-    return raised / sixteenthRoot(1 + sixteenthPower(raised / LARGEST));
+    const double beyond = std::max(0.0, fourth(x) - fourth(EXACT_PART));
+    return sixteenthRoot(1 + fourth(beyond));
 }
 
 // (sum x^4)^(1/8)
@@ -70,7 +93,8 @@ void requireFinite(double value, const char* name) {
 } // namespace
 
 AutomaticControl::AutomaticControl(const ConstraintSystem& system) :
-        system(system), numClusters((int) system.getClusters().size()), references(), memory(), measured() {
+        system(system), numClusters((int) system.getClusters().size()), references(), memory(), temperature(0),
+        measured() {
     vector<int> clusters(system.getNumParticles(), -1);
     for (int c = 0; c < numClusters; c++)
         for (int i : system.getClusterParticles(c))
@@ -83,75 +107,120 @@ AutomaticControl::AutomaticControl(const ConstraintSystem& system) :
         movingParticles.push_back(i);
         clusterOfParticle.push_back(clusters[i]);
     }
+    numDegreesOfFreedom = std::max(1.0, 3.0 * (double) movingParticles.size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
+    netForces.resize(system.getNumParticles());
+    negativeMultipliers.resize(system.getNumConstraints());
+    jacobian.resize(system.getNumEntries());
 }
 
-// S_c = (Lambda^T K Lambda)_c + sum_{i in c} |F_i|^2/m_i
-void AutomaticControl::sumForceSquares(const vector<Vec3>& force, const vector<double>& multipliers,
-                                       const vector<double>& rightSides, vector<double>& squares) const {
+// -------------------------------------------------------------------------------------------------------- the monitors
+
+// N = F - G^T Lambda
+void AutomaticControl::findNetForces(const State& state) {
+    netForces = state.forces;
+    if (system.getNumConstraints() == 0)
+        return;
+    system.evaluateJacobian(state.positions, state.parameters, jacobian);
+    for (size_t k = 0; k < negativeMultipliers.size(); k++)
+        negativeMultipliers[k] = -state.multipliers[k];
+    system.addTransposed(jacobian, negativeMultipliers, netForces);
+}
+
+// S_c and 2K/f
+void AutomaticControl::findSquares(const State& state, vector<double>& squares) {
+    findNetForces(state);
     std::fill(squares.begin(), squares.end(), 0.0);
-    const vector<ConstraintSystem::Cluster>& clusters = system.getClusters();
-    for (size_t c = 0; c < clusters.size(); c++) {
-        double sum = 0;
-        for (int k = clusters[c].first; k < clusters[c].first + clusters[c].size; k++)
-            sum += multipliers[k] * rightSides[k];
-        squares[c] = std::isnan(sum) ? sum : std::max(sum, 0.0); // rounding could make it negative where it vanishes
-    }
-    const vector<double>& inverseMasses = system.getInverseMasses();
+    temperature = 0;
     for (size_t p = 0; p < movingParticles.size(); p++) {
         const int i = movingParticles[p];
-        squares[clusterOfParticle[p]] += force[i].dot(force[i]) * inverseMasses[i];
+        const double mass = system.getMasses()[i], speedSquared = state.velocities[i].dot(state.velocities[i]);
+        squares[clusterOfParticle[p]] += netForces[i].dot(netForces[i]) * system.getInverseMasses()[i] +
+                                         mass * speedSquared * speedSquared / (FLIGHT * FLIGHT);
+        temperature += mass * speedSquared / numDegreesOfFreedom;
     }
 }
 
 // U_A from S_c
-double AutomaticControl::evaluateOnStep(const vector<Vec3>& v, const vector<Vec3>& force,
-                                        const vector<double>& squares) {
+double AutomaticControl::evaluateOnStep(const State& state, const vector<double>& squares) {
     scratch = squares;
     for (size_t p = 0; p < movingParticles.size(); p++) {
         const int i = movingParticles[p];
-        scratch[clusterOfParticle[p]] += std::sqrt(force[i].dot(force[i])) * v[i].dot(v[i]) / LENGTH;
+        const Vec3 &force = state.forces[i], &v = state.velocities[i];
+        scratch[clusterOfParticle[p]] += std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
     }
     return eighthRootOfFourthPowers(scratch);
 }
 
-void AutomaticControl::begin(const vector<Vec3>& v, const vector<Vec3>& force, const vector<double>& multipliers,
-                             const vector<double>& rightSides) {
-    sumForceSquares(force, multipliers, rightSides, memory.forceSquares);
-    memory.values[OnStep] = evaluateOnStep(v, force, memory.forceSquares);
+void AutomaticControl::begin(const State& state) {
+    findSquares(state, memory.forceSquares);
+    memory.values[OnStep] = evaluateOnStep(state, memory.forceSquares);
     memory.values[HalfStep] = 0;
 }
 
-void AutomaticControl::measure(const vector<Vec3>& v, const vector<Vec3>& force, const vector<double>& multipliers,
-                               const vector<double>& rightSides, const vector<Vec3>& w, double size,
-                               const vector<Vec3>& oldForce) {
-    sumForceSquares(force, multipliers, rightSides, measuredSquares);
-    measured[OnStep] = evaluateOnStep(v, force, measuredSquares);
+void AutomaticControl::measure(const State& state, const vector<Vec3>& w, double size, const vector<Vec3>& oldForce) {
+    findSquares(state, measuredSquares);
+    measured[OnStep] = evaluateOnStep(state, measuredSquares);
     requireFinite(measured[OnStep], "U_A");
     std::fill(scratch.begin(), scratch.end(), 0.0);
     for (size_t p = 0; p < movingParticles.size(); p++) {
         const int i = movingParticles[p];
-        scratch[clusterOfParticle[p]] += w[i].dot(force[i] - oldForce[i]);
+        scratch[clusterOfParticle[p]] += w[i].dot(state.forces[i] - oldForce[i]);
     }
     for (int c = 0; c < numClusters; c++)
-        scratch[c] = 2 / size * std::fabs(scratch[c]) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
+        scratch[c] =
+            CHANGE_WEIGHT * 2 / size * std::fabs(scratch[c]) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
     measured[HalfStep] = eighthRootOfFourthPowers(scratch);
     requireFinite(measured[HalfStep], "U_B");
 }
 
-// f(phi(u))
+// The value of a monitor where the momenta of every cluster change by those of this 2K/f in a nominal step.
+double AutomaticControl::thermalValue(double kT) const {
+    return std::sqrt(kT) * std::pow((double) std::max(1, numClusters), 0.125) / settings.stepSize;
+}
+
+double AutomaticControl::getNegligibleValue() const {
+    return NEGLIGIBLE * thermalValue(ROOM_TEMPERATURE);
+}
+
+// ------------------------------------------------------------------------------------------------------- the densities
+
+// No step is below the minimum, and a density of 1 stays what it is.
+double AutomaticControl::limit(double density) const {
+    if (!(density > 1) || settings.minimumStep == 0)
+        return density;
+    const double excess = density - 1, largest = settings.stepSize / settings.minimumStep - 1;
+    return 1 + excess / sixteenthRoot(1 + sixteenthPower(std::min(excess / largest, 1e15)));
+}
+
+// f(phi(u)); f(1) while there is no reference
 double AutomaticControl::target(int monitor, double value) const {
-    return f(applyDeadZone(std::pow(value / references[monitor], POWERS[monitor])));
+    if (!isKnown(monitor))
+        return 0;
+    return f(limit(applyDeadZone(std::pow(value / references[monitor], POWERS[monitor]))));
 }
 
-double AutomaticControl::combine(const double (&transformed)[NUM_MONITORS]) {
+double AutomaticControl::combine(const double (&transformed)[NUM_MONITORS]) const {
     const double a = inverseOfF(transformed[OnStep]), b = inverseOfF(transformed[HalfStep]);
-    return std::sqrt(0.5 * (a * a + b * b));
+    return limit(std::sqrt(0.5 * (a * a + b * b)));
 }
 
-double AutomaticControl::densityOf(const double (&values)[NUM_MONITORS]) const {
-    return combine({target(OnStep, values[OnStep]), target(HalfStep, values[HalfStep])});
+// U_B is not known before the first step; it asks for what U_A does.
+void AutomaticControl::start() {
+    for (int k = 0; k < NUM_MONITORS; k++)
+        if (settings.given[k] == 0 && memory.temperature > 0 && temperature > MUCH_HOTTER * memory.temperature)
+            references[k] = 0;
+    memory.following = 0;
+    if (!isKnown(OnStep) || !isKnown(HalfStep)) {
+        memory.numLearnt = memory.temperature = 0;
+        std::fill(std::begin(memory.logarithms), std::end(memory.logarithms), 0.0);
+        findHard();
+    }
+    memory.stepsSinceStart = 0;
+    const double asked = target(OnStep, memory.values[OnStep]);
+    for (int k = 0; k < NUM_MONITORS; k++)
+        memory.behind[k] = memory.ahead[k] = asked;
 }
 
 void AutomaticControl::acceptMeasured() {
@@ -160,68 +229,133 @@ void AutomaticControl::acceptMeasured() {
 }
 
 void AutomaticControl::acceptStep() {
+    const double density = getNext();
+    memory.shortSteps = density * SHORT > 1 ? memory.shortSteps + 1 : 0;
+    memory.mostShortSteps = std::max(memory.mostShortSteps, memory.shortSteps);
     acceptMeasured();
+    adapt(1 / density);
     for (int k = 0; k < NUM_MONITORS; k++) {
         const double last = memory.behind[k];
         memory.behind[k] = memory.ahead[k];
         // A joins its two neighbours of step n, B those of half step n-1/2.
-        memory.ahead[k] = 2 * target(k, measured[k]) - (k == OnStep ? memory.ahead[k] : last);
+        memory.ahead[k] = 2 * target(k, memory.values[k]) - (k == OnStep ? memory.ahead[k] : last);
     }
 }
 
 // The densities move on by that part of what they would in a full step. U_B of a short step is spoiled by the rounding of the
 // forces, and counts only if the step is at least half a full one.
 void AutomaticControl::acceptPartOfStep(double part) {
+    const double nominalPart = part / getNext();
     acceptMeasured();
+    if (part >= 0.5)
+        adapt(nominalPart);
     for (int k = 0; k < NUM_MONITORS; k++) {
         const double behind = memory.behind[k], ahead = memory.ahead[k];
         memory.behind[k] += part * (ahead - behind);
         if (k == OnStep)
-            memory.ahead[k] = 2 * target(k, measured[k]) - memory.behind[k];
+            memory.ahead[k] = 2 * target(k, memory.values[k]) - memory.behind[k];
         else {
-            const double afterNext = (part < 0.5 ? 2 * ahead : 2 * target(k, measured[k])) - behind;
+            const double afterNext = (part < 0.5 ? 2 * ahead : 2 * target(k, memory.values[k])) - behind;
             memory.ahead[k] += part * (afterNext - ahead);
         }
     }
 }
 
-// As in docs/method.md, section 7, the smooth solution of x[n+1/2] + x[n-1/2] = 2 a[n] is, half a step before n = 0,
-// (a[-1] + a[0])/2 - (a[-2] - 2 a[-1] + a[0])/4, and that of y[n+1/2] + y[n-3/2] = 2 b[n-1/2] is b to second order.
-void AutomaticControl::start(const double (&back)[NUM_MONITORS], const double (&secondBack)[NUM_MONITORS]) {
-    const double a0 = target(OnStep, memory.values[OnStep]), a1 = target(OnStep, back[OnStep]),
-                 a2 = target(OnStep, secondBack[OnStep]);
-    const double smooth = 0.5 * (a0 + a1) - 0.25 * (a0 - 2 * a1 + a2);
-    memory.behind[OnStep] = std::min(std::max(smooth, std::min(a0, a1)), std::max(a0, a1));
-    memory.ahead[OnStep] = 2 * a0 - memory.behind[OnStep];
-    const double b1 = target(HalfStep, back[HalfStep]), b3 = target(HalfStep, secondBack[HalfStep]);
-    memory.values[HalfStep] = back[HalfStep];
-    memory.behind[HalfStep] = b1;
-    memory.ahead[HalfStep] = 2 * b1 - b3;
-}
-
-void AutomaticControl::change(const vector<Vec3>& v, const vector<Vec3>& force, const vector<double>& multipliers,
-                              const vector<double>& rightSides, double part) {
+void AutomaticControl::change(const State& state, double part) {
     const double before = target(OnStep, memory.values[OnStep]), halfStepValue = memory.values[HalfStep];
-    begin(v, force, multipliers, rightSides);
+    begin(state);
     memory.values[HalfStep] = halfStepValue;
+    if (part > ROUNDING) {
+        memory.following = LAST_CHANGE;
+        raiseReferences();
+    }
     const double shift = target(OnStep, memory.values[OnStep]) - before;
     memory.behind[OnStep] += shift;
     memory.ahead[OnStep] += shift;
-    for (int k = 0; k < NUM_MONITORS; k++)
-        for (double* each : {&memory.behind[k], &memory.ahead[k]})
-            *each += part * (target(k, memory.values[k]) - *each);
+    draw(part);
 }
 
 void AutomaticControl::reverse() {
     std::swap_ranges(memory.behind, memory.behind + NUM_MONITORS, memory.ahead);
 }
 
-double AutomaticControl::getNegligibleValue(const vector<Vec3>& v) const {
-    vector<double> largest(numClusters, 0.0);
-    for (size_t p = 0; p < movingParticles.size(); p++) {
-        const int i = movingParticles[p];
-        const double acceleration = ROUNDING * v[i].dot(v[i]) / LENGTH;
-        largest[clusterOfParticle[p]] += system.getMasses()[i] * acceleration * acceleration;
+// Draw both sequences towards their monitors by a part of their distance.
+void AutomaticControl::draw(double part) {
+    for (int k = 0; k < NUM_MONITORS; k++) {
+        if (memory.values[k] == 0) // not known yet, or there is nothing
+            continue;
+        for (double* each : {&memory.behind[k], &memory.ahead[k]})
+            *each += part * (target(k, memory.values[k]) - *each);
     }
-    return eighthRootOfFourthPowers(largest);
+}
+
+// ------------------------------------------------------------------------------------------------------ the references
+
+// After a step that was this part of a nominal one. With other references the sequences keep their distances from the monitors.
+void AutomaticControl::adapt(double part) {
+    double before[NUM_MONITORS];
+    for (int k = 0; k < NUM_MONITORS; k++)
+        before[k] = target(k, memory.values[k]);
+    if (!isKnown(OnStep) || !isKnown(HalfStep))
+        learn();
+    else if (memory.following > 0)
+        follow(part);
+    for (int k = 0; k < NUM_MONITORS; k++) {
+        const double shift = target(k, memory.values[k]) - before[k];
+        memory.behind[k] += shift;
+        memory.ahead[k] += shift;
+    }
+    if (memory.stepsSinceStart < SETTLING_STEPS) {
+        memory.stepsSinceStart++;
+        draw(SETTLING);
+    }
+}
+
+// The user's references stay.
+void AutomaticControl::setFound(double onStep, double halfStep) {
+    references[OnStep] = settings.given[OnStep] > 0 ? settings.given[OnStep] : onStep;
+    references[HalfStep] = settings.given[HalfStep] > 0 ? settings.given[HalfStep] : halfStep;
+    memory.stepsSinceStart = 0;
+}
+
+// What is hard beyond doubt is not learnt from.
+bool AutomaticControl::findHard() {
+    const double kT = std::max(temperature, ROOM_TEMPERATURE);
+    if (!(memory.values[OnStep] > HARD * thermalValue(kT)))
+        return false;
+    setFound(HARD_REFERENCE * thermalValue(kT), HARD_REFERENCE * thermalValue(kT));
+    memory.temperature = kT;
+    return true;
+}
+
+// Nor is a step in which nothing pulls and nothing moves.
+void AutomaticControl::learn() {
+    if (findHard() || std::min(memory.values[OnStep], memory.values[HalfStep]) <= getNegligibleValue())
+        return;
+    memory.numLearnt++;
+    memory.temperature += (temperature - memory.temperature) / memory.numLearnt;
+    for (int k = 0; k < NUM_MONITORS; k++)
+        memory.logarithms[k] += (std::log(memory.values[k]) - memory.logarithms[k]) / memory.numLearnt;
+    if (memory.numLearnt >= settings.learningSteps)
+        setFound(std::exp(memory.logarithms[OnStep]), std::exp(memory.logarithms[HalfStep]));
+}
+
+// A mean over the last steps that nothing can capture.
+void AutomaticControl::follow(double part) {
+    memory.following--;
+    const double weight = part / FOLLOWING_STEPS;
+    memory.temperature += std::min(1.0, weight) * (temperature - memory.temperature);
+    for (int k = 0; k < NUM_MONITORS; k++) {
+        const double surprise = std::log(memory.values[k] / references[k]);
+        if (settings.given[k] == 0)
+            references[k] *= std::exp(weight * std::min(std::max(surprise, -LARGEST_SURPRISE), LARGEST_SURPRISE));
+    }
+    raiseReferences();
+}
+
+void AutomaticControl::raiseReferences() {
+    for (int k = 0; k < NUM_MONITORS; k++)
+        if (settings.given[k] == 0 && isKnown(k))
+            references[k] =
+                std::max(references[k], std::max(FOLLOWING_FLOOR * thermalValue(temperature), getNegligibleValue()));
 }

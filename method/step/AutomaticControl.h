@@ -13,20 +13,26 @@ namespace OpenMMVRattle {
 /**
  * Automatic step control: the density rho from two monitors that need no choice (docs/automatic.md has the reasons).
  *
- * With clusters c (particles joined by constraints; a free particle is one of its own), the applied force F and
- * S_c = (Lambda^T K Lambda)_c + sum_{i in c} |F_i|^2/m_i, the squared mass-weighted size of both forces,
+ * A cluster c is a set of particles joined by constraints; a free particle is one of its own. With the applied force F, the net
+ * force N = F - G^T Lambda, and what would turn the flight of a particle on the length l_f,
  *
- *     on step n:           A_c = S_c + sum_{i in c} |F_i| |v_i|^2/l,                             U_A = (sum_c A_c^4)^(1/8)
- *     on half step n-1/2:  B_c = (2/dt) |sum_{i in c} w_i . (F_i[n] - F_i[n-1])| + (S_c[n] + S_c[n-1])/2,
- *                                                                                                U_B = (sum_c B_c^4)^(1/8)
+ *     S_c = sum_{i in c} (|N_i|^2/m_i + m_i |v_i|^4/l_f^2),
+ *     on step n:           A_c = S_c + sum_{i in c} |F_i| |v_i|^2/l,                                  U_A = (sum_c A_c^4)^(1/8)
+ *     on half step n-1/2:  B_c = (6/dt) |sum_{i in c} w_i . (F_i[n] - F_i[n-1])| + (S_c[n] + S_c[n-1])/2,
+ *                                                                                                     U_B = (sum_c B_c^4)^(1/8)
  *
- * u_A = (U_A/ref_A)^(2/3) and u_B = (U_B/ref_B)^(4/5) go through phi, which is 1 while they are small (the dead zone), and
+ * u_A = (U_A/ref_A)^(2/3) and u_B = (U_B/ref_B)^(4/5) go through phi, which is exactly 1 while they are small (the dead zone), and
  *
  *     f(A[n+1/2]) + f(A[n-1/2]) = 2 f(phi(u_A[n])),   f(B[n+1/2]) + f(B[n-3/2]) = 2 f(phi(u_B[n-1/2])),
- *     rho = sqrt((A^2 + B^2)/2).
+ *     rho = sqrt((A^2 + B^2)/2), and no more than stepSize/minimumStep.
  *
  * Both are symmetric in time, explicit, and cannot fail, since f maps (3/4, infinity) onto the real line. What is kept between
  * steps are f(A) and f(B) on the half steps behind and ahead, so that turning time around exchanges the two.
+ *
+ * The references are the geometric means of U_A and U_B over the first steps of the run, which have the nominal size. What is
+ * hard beyond doubt then, in units of the thermal momentum a step, puts references of these units in force at once. As long as
+ * Forces change the state, the references follow it. All of it are sums over clusters and particles, and a few numbers:
+ * nothing that a device would need its host for.
  */
 class AutomaticControl {
 public:
@@ -34,24 +40,37 @@ public:
     enum Monitor { OnStep, HalfStep };
     static constexpr int NUM_MONITORS = 2;
 
+    /** What a user can choose. */
+    struct Settings {
+        double stepSize = 0, minimumStep = 0;     // ps; no minimum if that is 0
+        int learningSteps = 1;                    // how many steps the references are the mean of
+        double given[NUM_MONITORS] = {};          // references that are not to be found; 0 for the others
+    };
+
     /** What the following steps depend on, beside the references. */
     struct Memory {
         double behind[NUM_MONITORS], ahead[NUM_MONITORS]; // f(A), f(B) on the half steps n-1/2 and n+1/2
         double values[NUM_MONITORS];                      // U_A[n] and U_B[n-1/2], the latter 0 before the first step
         std::vector<double> forceSquares;                 // S_c[n]
+        double stepsSinceStart;                           // of this sequence, as far as they count
+        double numLearnt, logarithms[NUM_MONITORS]; // steps that have been learnt from, and the mean of ln U over them
+        double temperature; // 2K/f (kJ/mol) where the references were found
+        double following; // for how many steps the references follow the run
+        double shortSteps,
+            mostShortSteps; // steps in a row below a tenth of the nominal one: now, and the most there were
     };
 
     explicit AutomaticControl(const ConstraintSystem& system);
 
+    void setSettings(const Settings& newSettings) {
+        settings = newSettings;
+    }
     /** The reference value of a monitor, 0 while it is not known. */
     double getReference(int monitor) const {
         return references[monitor];
     }
     void setReference(int monitor, double value) {
         references[monitor] = value;
-    }
-    bool hasReferences() const {
-        return references[OnStep] > 0 && references[HalfStep] > 0;
     }
     const Memory& getMemory() const {
         return memory;
@@ -60,28 +79,33 @@ public:
         memory = newMemory;
     }
 
+    /** An on-step state. */
+    struct State {
+        const std::vector<OpenMM::Vec3>& positions; // nm
+        const ExpressionParameters& parameters; // of expressions
+        const std::vector<OpenMM::Vec3>& velocities; // nm/ps
+        const std::vector<OpenMM::Vec3>& forces; // the applied ones (kJ/mol/nm)
+        const std::vector<double>& multipliers; // Lambda(q,p), in internal order
+    };
+    /** Take over an on-step state that no step has led to: S_c and U_A. */
+    void begin(const State& state);
     /**
-     * Take over an on-step state that no step has led to: S_c and U_A.
-     *
-     * @param v              the velocities (nm/ps)
-     * @param force          the applied forces (kJ/mol/nm)
-     * @param multipliers    Lambda(q,p), in internal order
-     * @param rightSides     K Lambda
+     * Start the sequences at the state of begin(), and to find references if there are none, or if those that there are were found
+     * at much smaller velocities.
      */
-    void begin(const std::vector<OpenMM::Vec3>& v, const std::vector<OpenMM::Vec3>& force,
-               const std::vector<double>& multipliers, const std::vector<double>& rightSides);
+    void start();
     /**
-     * Compute U_A at the end of a step and U_B of the step itself; arguments as in begin(), there. Nothing is taken over until
-     * one of the functions below is called.
+     * Compute U_A at the end of a step and U_B of the step itself. Nothing is taken over until one of the functions below
+     * is called.
      *
+     * @param state       at its end
      * @param w           M^-1 p[n-1/2]
      * @param size        dt, the size of the step (ps)
      * @param oldForce    the applied forces at its start
      * @throws StepFailure    if a monitor is infinite or not a number
      */
-    void measure(const std::vector<OpenMM::Vec3>& v, const std::vector<OpenMM::Vec3>& force,
-                 const std::vector<double>& multipliers, const std::vector<double>& rightSides,
-                 const std::vector<OpenMM::Vec3>& w, double size, const std::vector<OpenMM::Vec3>& oldForce);
+    void measure(const State& state, const std::vector<OpenMM::Vec3>& w, double size,
+                 const std::vector<OpenMM::Vec3>& oldForce);
     /** Take over what measure() has found, without a density (a trial run of fixed steps). */
     void acceptMeasured();
     /** Take over what measure() has found, as the end of a step of density getNext(). */
@@ -89,20 +113,13 @@ public:
     /** The same for a step that was only this part of a full one, between 0 and 1. */
     void acceptPartOfStep(double part);
     /**
-     * Start the sequences from two steps backwards in time.
-     *
-     * @param back         U_A[-1] and U_B[-1/2]
-     * @param secondBack   U_A[-2] and U_B[-3/2]
-     */
-    void start(const double (&back)[NUM_MONITORS], const double (&secondBack)[NUM_MONITORS]);
-    /**
-     * Go on at a changed on-step state, other arguments as in begin(): A moves by as much as its monitor asks for, and so that
-     * changes again and again do not add up to an oscillation, both sequences are drawn towards their monitors.
+     * Go on at a changed on-step state: A moves by as much as its monitor asks for, and so that changes again and again do not add up
+     * to an oscillation, both sequences are drawn towards their monitors. Unless the change is mere rounding, the references
+     * follow the run for the next steps.
      *
      * @param part    by which part of their distance, between 0 for a change that is mere rounding and 1
      */
-    void change(const std::vector<OpenMM::Vec3>& v, const std::vector<OpenMM::Vec3>& force,
-                const std::vector<double>& multipliers, const std::vector<double>& rightSides, double part);
+    void change(const State& state, double part);
     /** Turn time around. */
     void reverse();
 
@@ -114,27 +131,42 @@ public:
     double getNext() const {
         return combine(memory.ahead);
     }
-    /** The density that U_A and U_B alone ask for. */
-    double densityOf(const double (&values)[NUM_MONITORS]) const;
-    /** A value of U_A or U_B below this is zero but for rounding. */
-    double getNegligibleValue(const std::vector<OpenMM::Vec3>& v) const;
+    /** Where all monitors are no more than this, there is nothing to learn from. */
+    double getNegligibleValue() const;
 
 private:
     double target(int monitor, double value) const;
-    static double combine(const double (&transformed)[NUM_MONITORS]);
-    void sumForceSquares(const std::vector<OpenMM::Vec3>& force, const std::vector<double>& multipliers,
-                         const std::vector<double>& rightSides, std::vector<double>& squares) const;
-    double evaluateOnStep(const std::vector<OpenMM::Vec3>& v, const std::vector<OpenMM::Vec3>& force,
-                          const std::vector<double>& squares);
+    double combine(const double (&transformed)[NUM_MONITORS]) const;
+    double limit(double density) const;
+    void findNetForces(const State& state);
+    void findSquares(const State& state, std::vector<double>& squares);
+    double evaluateOnStep(const State& state, const std::vector<double>& squares);
+    double thermalValue(double temperature) const;
+    bool isKnown(int monitor) const {
+        return references[monitor] > 0;
+    }
+    void draw(double part);
+    void adapt(double part);
+    void setFound(double onStep, double halfStep);
+    bool findHard();
+    void learn();
+    void follow(double part);
+    void raiseReferences();
 
     const ConstraintSystem& system;
     std::vector<int> movingParticles;
     std::vector<int> clusterOfParticle; // of each moving particle in that order
     int numClusters;
+    double numDegreesOfFreedom;
+    Settings settings;
     double references[NUM_MONITORS];
     Memory memory;
+    double temperature; // 2K/f of the state that was looked at last
     double measured[NUM_MONITORS]; // by measure()
     std::vector<double> measuredSquares, scratch;
+    std::vector<OpenMM::Vec3> netForces;
+    std::vector<double> negativeMultipliers;
+    ConstraintSystem::Jacobian jacobian;
 };
 
 } // namespace OpenMMVRattle

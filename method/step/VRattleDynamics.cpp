@@ -27,10 +27,10 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
                                  const vector<ExpressionConstraint>& expressions) :
         system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
         automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
-        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false),
-        factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0), kickNext(0),
-        areParametersChanging(false), densityScale(1), isJump(false), isRescued(false), numIterations(0), numRescues(0),
-        lastError(0) {
+        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isStartedNow(false),
+        isCalm(false), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0),
+        kickNext(0), areParametersChanging(false), densityScale(1), isJump(false), isRescued(false), numIterations(0),
+        numRescues(0), lastError(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     for (int i = 0; i < numParticles; i++)
         if (masses[i] > 0)
@@ -78,6 +78,7 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     for (size_t i = 0; i < terms.size() && sameDensity; i++)
         sameDensity = terms[i].reference == monitor.getTerms()[i].reference;
     settings = newSettings;
+    setControlSettings();
     monitor.setTerms(terms);
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
     if (q.empty() || sameDensity)
@@ -86,13 +87,24 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     monitor.evaluate(v, lambda, rightSide, values);
     rate = 0; // only the speed of convergence of the next step depends on it
     if (settings.isAutomatic && !sameControl)
-        automatic.begin(v, force, lambda, rightSide);
+        automatic.begin({q, theta, v, force, lambda});
     if (!sameTerms || !sameControl || retakeReference)
         forgetDensity();
     else
         rescaleDensity(u);
+    if (hasDensity && settings.isAutomatic)
+        rho = automatic.getLast(); // which the bound may have changed
     if (hasDensity)
         formHalfStepVelocities();
+}
+
+void VRattleDynamics::setControlSettings() {
+    AutomaticControl::Settings control;
+    control.stepSize = settings.stepSize;
+    control.minimumStep = settings.minimumStep;
+    control.learningSteps = settings.calibrationSteps;
+    std::copy(std::begin(settings.automaticReferences), std::end(settings.automaticReferences), control.given);
+    automatic.setSettings(control);
 }
 
 // Returns whether automatic step control has the references that it had.
@@ -188,12 +200,13 @@ void VRattleDynamics::beginAt(const vector<Vec3>& positions, const vector<Vec3>&
     }
     isMonitorCurrent = true;
     if (settings.isAutomatic)
-        automatic.begin(v, force, lambda, rightSide);
+        automatic.begin({q, theta, v, force, lambda});
 }
 
-void VRattleDynamics::startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
-                                     const double (&secondBack)[AutomaticControl::NUM_MONITORS]) {
-    automatic.start(back, secondBack);
+void VRattleDynamics::startAutomatic() {
+    controlBefore = automatic.getMemory();
+    isStartedNow = true;
+    automatic.start();
     hasDensity = true;
     rho = automatic.getLast();
     formHalfStepVelocities();
@@ -236,6 +249,7 @@ VRattleDynamics::Kept VRattleDynamics::keep() const {
 
 void VRattleDynamics::putBack(const Kept& kept) {
     settings = kept.settings;
+    setControlSettings();
     monitor.setTerms(settings.terms);
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
     q = kept.positions;
@@ -292,7 +306,7 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
     rescaleDensity(oldU);
     if (settings.isAutomatic) {
         automatic.setMemory(oldControl);
-        automatic.change(v, force, lambda, rightSide, 1.0);
+        automatic.change({q, theta, v, force, lambda}, 1.0);
         rho = automatic.getLast();
     }
     if (hasDensity)
@@ -319,7 +333,7 @@ bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
         rescaleDensity(u);
     }
     if (settings.isAutomatic)
-        automatic.change(v, force, lambda, rightSide, 0.0);
+        automatic.change({q, theta, v, force, lambda}, 0.0);
     return true;
 }
 
@@ -340,7 +354,7 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     rescaleDensity(u);
     // The density of the last step stays, for its kick is in w.
     if (settings.isAutomatic)
-        automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
+        automatic.change({q, theta, v, force, lambda}, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
 }
 
 void VRattleDynamics::changeForces(vector<Vec3>& forces, double energy) {
@@ -371,12 +385,12 @@ void VRattleDynamics::changeForces(vector<Vec3>& forces, double energy) {
     if (!hasDensity) {
         forgetDensity();
         if (settings.isAutomatic)
-            automatic.begin(v, force, lambda, rightSide);
+            automatic.begin({q, theta, v, force, lambda});
         return;
     }
     rescaleDensity(u);
     if (settings.isAutomatic) {
-        automatic.change(v, force, lambda, rightSide, std::min(1.0, std::sqrt(changeSquared / forceSquared)));
+        automatic.change({q, theta, v, force, lambda}, std::min(1.0, std::sqrt(changeSquared / forceSquared)));
         rho = automatic.getLast();
     }
     if (hasDensity)
@@ -408,18 +422,19 @@ double VRattleDynamics::step(double maxStep) {
     work.beginStep();
     isRescued = false;
     ensureFactor(NoFactor); // of a step before that has failed, the monitor may have the forces still
+    isStartedNow = false;
     prepareParameters();
     findJump();
     double full;
+    if (!hasDensity)
+        referencesBefore = firstDensity == 0 ? getReferences() : referencesBefore;
+    if (!hasDensity && settings.isAutomatic && !settings.isFixedStep)
+        startAutomatic();
     if (hasDensity) {
         stepKind = Regular;
         full = solveRegular();
     }
     else {
-        if (firstDensity == 0)
-            referencesBefore = getReferences();
-        if (settings.isAutomatic && !settings.isFixedStep)
-            throw StepFailure("the automatic step control has not been started");
         stepKind = First;
         rhoNext = firstDensity > 0 ? firstDensity : findFirstDensity();
         full = settings.stepSize / rhoNext;
@@ -518,7 +533,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
     if (settings.isAutomatic)
-        automatic.measure(vNext, forces, lambdaOnStep, rightSideNext, wNext, stepNext, force);
+        automatic.measure({qNext, thetaNext, vNext, forces, lambdaOnStep}, wNext, stepNext, force);
     // From here on nothing fails.
     work.endStep();
     if (stepKind == First && isCalm)
@@ -559,7 +574,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
         u = combineAndLimit(values);
     }
     if (settings.isAutomatic && hasDensity && isJump)
-        automatic.change(v, force, lambda, rightSide, 1.0);
+        automatic.change({q, theta, v, force, lambda}, 1.0);
     if (hasDensity && stepKind == Shortened)
         formHalfStepVelocities();
     return true;
@@ -568,6 +583,10 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
 void VRattleDynamics::abandonStep() {
     numRescues -= isRescued;
     isRescued = false;
+    if (isStartedNow) {
+        automatic.setMemory(controlBefore);
+        forgetDensity();
+    }
     if (!hasDensity)
         setReferences(referencesBefore);
     firstDensity = 0;

@@ -43,10 +43,11 @@ public:
         StepDensity::Update update;
         std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
         bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
-        // Automatic step control, in place of monitors, update and bounds. A reference of 0 stands for the one in force.
+        // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
         bool isAutomatic = false;
         double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
         int automaticRequest = 0; // changes when references in force are to be forgotten
+        int calibrationSteps = 1; // how many steps the references are found from
     };
 
     /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
@@ -189,9 +190,6 @@ public:
     const AutomaticControl& getAutomaticControl() const {
         return automatic;
     }
-    /** Start the densities of automatic step control; see AutomaticControl::start(). The references must be known. */
-    void startAutomatic(const double (&back)[AutomaticControl::NUM_MONITORS],
-                        const double (&secondBack)[AutomaticControl::NUM_MONITORS]);
     /** Turn time around, without a force. */
     void reverse();
 
@@ -245,6 +243,8 @@ private:
     enum FactorScope { NoFactor, GeneralFactor, FullFactor };
     void requireConstraintsFor(const std::vector<StepMonitor::Term>& terms) const;
     bool takeAutomaticReferences(const Settings& newSettings);
+    void setControlSettings();
+    void startAutomatic();
     void acceptAutomatic();
     void setMemory(const Memory& memory);
     void forgetDensity();
@@ -349,6 +349,8 @@ private:
     double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
     double densityOffset; // what (3.14) and (3.15) differed by in the last step
     double firstDensity; // of the first step, once it is known; else 0
+    bool isStartedNow; // automatic step control, by the step in progress
+    AutomaticControl::Memory controlBefore; // that
     bool isCalm; // whether the first step is one that starts no sequence
     std::vector<char> isNegligible; // each monitor, at the first step
     std::vector<double> referencesBefore; // the first step, as long as firstDensity is known

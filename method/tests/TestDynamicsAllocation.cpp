@@ -65,8 +65,6 @@ void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int 
     dynamics.setSettings(settings);
     vector<Vec3> forces(e.masses.size());
     dynamics.begin(e.positions, e.velocities, forces, 0);
-    if (settings.isAutomatic)
-        dynamics.startAutomatic({1.1e4, 1.1e4}, {1e4, 1e4});
     auto takeSteps = [&](int count) {
         for (int i = 0; i < count; i++)
             do

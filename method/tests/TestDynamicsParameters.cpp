@@ -494,8 +494,6 @@ void testResume() {
         for (VRattleDynamics* each : {&dynamics, &other})
             each->setSettings(settings);
         dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
-        if (isAutomatic)
-            dynamics.startAutomatic({120, 150}, {110, 140});
         for (int step = 0; step < 10; step++) {
             e.setParameters(dynamics, step);
             takeStep(dynamics, springs);
@@ -569,7 +567,6 @@ void testDensityAtStartOfMotion(const VRattleDynamics::Settings& settings) {
     if (settings.isAutomatic) { // without a force its two monitors are the same
         const double value = dynamics.getAutomaticControl().getMemory().values[0];
         dynamics.setReferences({value / 4, value / 4});
-        dynamics.startAutomatic({value, value}, {value, value});
     }
     double tilt = 0.3, largest = 0;
     for (int step = 0; step < 300; step++) {
@@ -609,8 +606,6 @@ void testChangedForces(const VRattleDynamics::Settings& settings) {
             return forces;
         };
         dynamics.begin(e.positions, e.velocities, field(e.positions), 0);
-        if (settings.isAutomatic)
-            dynamics.startAutomatic({120, 150}, {110, 140});
         takeStep(dynamics, field);
         double time = 0, work = 0;
         const double start = kineticEnergy(dynamics) + potential();
@@ -637,8 +632,6 @@ void testChangedForces(const VRattleDynamics::Settings& settings) {
         VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
         dynamics.setSettings(settings);
         dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
-        if (settings.isAutomatic)
-            dynamics.startAutomatic({120, 150}, {110, 140});
         for (int step = 0; step < 5; step++) {
             takeStep(dynamics, springs);
             if (tries) {

@@ -72,9 +72,6 @@ public:
     }
     void writeVelocities() override {
     }
-    bool hasStarted() override {
-        return true;
-    }
     void step(double) override {
         calls += '+';
         numAsked++;
@@ -131,13 +128,6 @@ public:
     }
     double getNegligibleValue() override {
         return 0;
-    }
-    double densityOf(const vector<double>&) override {
-        return 1;
-    }
-    void startDensities(const vector<double>&, const vector<double>&) override {
-    }
-    void undoStartDensities() override {
     }
     void save(RunState&) override {
         calls += 'w';

@@ -317,6 +317,10 @@ long long VariableStepRattleIntegrator::getNumRescues() const {
     return run == nullptr ? 0 : run->getDevice().getNumRescues();
 }
 
+long long VariableStepRattleIntegrator::getNumShortSteps() const {
+    return run == nullptr ? 0 : run->getDevice().getNumShortSteps();
+}
+
 void VariableStepRattleIntegrator::setConstraintTolerance(double tol) {
     requirePositive(tol, "constraint tolerance");
     Integrator::setConstraintTolerance(tol);

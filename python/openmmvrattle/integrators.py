@@ -21,6 +21,7 @@ from ._arguments import constraint_arguments, integer, monitor_arguments, number
 __all__ = ["VariableStepRattleIntegrator"]
 
 _TIME = unit.picosecond
+_MANY_SHORT_STEPS = 1000
 _MULTIPLIER = unit.kilojoule_per_mole / unit.nanometer**2
 
 
@@ -51,9 +52,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run,
     and after each change of the state by the user or by a Force that moves particles (a barostat); one more where the
     first step is taken with a given reference value, since that step is then taken twice; one after loading a
-    checkpoint or a State, to compare the forces with the saved ones; and the trial steps of calibrate() and of
-    automatic step control. A monitor ForceGroupEnergy costs the energy of its group on top of each.
-    getNumForceEvaluations() counts all.
+    checkpoint or a State, to compare the forces with the saved ones; and the trial steps of calibrate(). A monitor
+    ForceGroupEnergy costs the energy of its group on top of each. getNumForceEvaluations() counts all.
 
     The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly
     coupled are met to the tolerance or the step fails with an exception; and the multipliers, that is the constraint
@@ -126,6 +126,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     MaxParticleArcLength: int = vrattle.VariableStepRattleIntegrator.MaxParticleArcLength
     ForceGroupEnergy: int = vrattle.VariableStepRattleIntegrator.ForceGroupEnergy
 
+    _has_warned = False  # of short steps
+
     def __init__(
         self,
         stepSize: float | unit.Quantity,
@@ -152,7 +154,8 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         updateMethod : int
             the recursion of the step density: SemiExplicit (the default), Explicit or Bounded
         minimumStepSize : float or Quantity
-            the smallest step size the monitor can ask for (in ps); 0 means no bound. Default: 1/50 of stepSize
+            the smallest step size the monitor can ask for (in ps); 0 means no bound. Default: 1/50 of stepSize, and
+            1/1000 of it if automatic
         maximumStepSize : float or Quantity
             the largest step size the monitor can ask for (in ps); 0 means no bound. Default: twice stepSize
         constraintTolerance : float
@@ -169,7 +172,7 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
             the force group whose energy is the monitor ForceGroupEnergy. Default: 31
         automatic : bool
             whether the integrator chooses its steps by itself, see useAutomaticStepControl(); then updateMethod,
-            minimumStepSize, maximumStepSize, monitors and referenceMonitorValue must not be given
+            maximumStepSize, monitors and referenceMonitorValue must not be given
 
         Raises
         ------
@@ -180,7 +183,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
             raise TypeError(f"automatic must be True or False, not {automatic!r}")
         excluded = {
             "updateMethod": updateMethod,
-            "minimumStepSize": minimumStepSize,
             "maximumStepSize": maximumStepSize,
             "monitors": monitors,
             "referenceMonitorValue": referenceMonitorValue,
@@ -460,32 +462,37 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         super().setMonitorForceGroup(integer(group, "group"))
 
-    def useAutomaticStepControl(self, calibrationSteps: int = 300) -> None:
+    def useAutomaticStepControl(self, calibrationSteps: int = 30) -> None:
         """Let the integrator choose its steps by itself: the setting for most uses.
 
         It takes steps of the nominal size while nothing out of the ordinary happens, and shorter ones when something
         does, by two monitors of its own (docs/automatic.md):
 
-         - 0, U_A, on each step: the size of the constraint and applied forces of the hardest clusters of particles, and
-           of the forces times the squared speeds, in nm amu^(1/2)/ps^2;
+         - 0, U_A, on each step: the size of the net force, applied and of constraints, of the hardest clusters of
+           particles, and of the applied forces times the squared speeds, in nm amu^(1/2)/ps^2;
          - 1, U_B, of each step between: from the change of the forces along it, the second time derivative of the
            potential energy, in the same unit.
 
-        They take the place of the monitors, which are removed, and of the update and the bounds, which have no effect
-        then: no step is ever larger than 4/3 of the nominal one. clearMonitors() and addMonitor() end it.
-        getMonitorValue(), getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
+        They take the place of the monitors, which are removed, and of the update and the maximum step size, which have
+        no effect then: no step is ever larger than 4/3 of the nominal one, and none smaller than the minimum step size,
+        by default 1/1000 of the nominal one. clearMonitors() and addMonitor() end it. getMonitorValue(),
+        getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
 
-        The first step is preceded by a trial run of fixed steps of the nominal size from the state at that time, which
-        leaves the Context as it was. The geometric means of the monitors over it become their reference values, unless
-        these have been set. They stay in force when the state is changed later; calling this again, or calibrate(),
-        takes new ones. Take them where the forces are typical: a reference value that is too small makes steps shorter
-        than they need be. Each start, also after positions, velocities or parameters have been changed, takes two trial
-        steps more. All trial steps count as evaluations of the forces.
+        The first steps have the nominal size, and the geometric means of the monitors over them become their reference
+        values, unless these have been set; getReferenceMonitorValue() is 0 until then. Steps in which nothing moves and
+        nothing pulls do not count. A start in a clash is seen at once. At constant energy the reference values then
+        stay what they are, so that the run is reversible; where Forces change the state (a thermostat, a barostat) they
+        follow it, and where velocities are set that are more than twice as large (four times the kinetic energy) they
+        are found anew, as when this is called again. No step costs more than one evaluation of the forces.
+
+        A run that takes 1000 steps in a row that are shorter than a tenth of the nominal size says so once, with a
+        warning: something is hard all the time, or the reference values belong to calmer times, and then calling this
+        again finds new ones. See getNumShortSteps().
 
         Parameters
         ----------
         calibrationSteps : int
-            the number of trial steps, at least 1
+            the number of first steps that the reference values are found from, at least 1
 
         Raises
         ------
@@ -505,12 +512,12 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         return super().isAutomatic()
 
     def getCalibrationSteps(self) -> int:
-        """Get the number of trial steps of the automatic step control, as it was set last.
+        """Get from how many first steps the automatic step control finds its reference values, as it was set last.
 
         Returns
         -------
         int
-            the number of trial steps
+            the number of steps
         """
         return super().getCalibrationSteps()
 
@@ -810,6 +817,17 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         return super().getNumRescues()
 
+    def getNumShortSteps(self) -> int:
+        """Get the most steps in a row that automatic step control has made shorter than a tenth of the nominal size
+        since the Context was created.
+
+        Returns
+        -------
+        int
+            the number of steps
+        """
+        return super().getNumShortSteps()
+
     def setConstraintTolerance(self, tol: float) -> None:
         """Set the relative tolerance of the constraints. Default: 1e-8.
 
@@ -843,7 +861,13 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         OpenMMException
             if there is no Context, or a step cannot be completed; the Context is then in the state before that step
         """
-        super().step(integer(steps, "steps"))
+        remaining = integer(steps, "steps")
+        while self.isAutomatic() and remaining > _MANY_SHORT_STEPS:
+            super().step(_MANY_SHORT_STEPS)
+            remaining -= _MANY_SHORT_STEPS
+            self._warn_of_short_steps()
+        super().step(remaining)
+        self._warn_of_short_steps()
 
     def stepTo(self, time: float | unit.Quantity) -> None:
         """Advance the simulation until a given time, which is met exactly by a shortened last step.
@@ -863,6 +887,18 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
             before that step
         """
         super().stepTo(number(time, "time", _TIME))
+        self._warn_of_short_steps()
+
+    def _warn_of_short_steps(self) -> None:
+        if self._has_warned or not self.isAutomatic() or super().getNumShortSteps() < _MANY_SHORT_STEPS:
+            return
+        self._has_warned = True
+        warnings.warn(
+            f"VariableStepRattleIntegrator: automatic step control has taken {_MANY_SHORT_STEPS} steps in a row that "
+            f"are shorter than a tenth of the nominal step size; if nothing is that hard here, find new reference "
+            f"values with useAutomaticStepControl(), or bound the steps with setMinimumStepSize()",
+            stacklevel=3,
+        )
 
     def reverse(self) -> None:
         """Turn time around: the velocities change sign, and the half-step momentum and the density become those of the

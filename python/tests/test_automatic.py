@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -30,11 +31,21 @@ from dense_reference import (
     whip,
 )
 from openmmvrattle import VariableStepRattleIntegrator, XmlSerializer
-from openmmvrattle.testsystems import TestSystem, alanine_dipeptide, light_heavy_chain, nitrogen_collision, rigid_waters
+from openmmvrattle.testsystems import (
+    TestSystem,
+    alanine_dipeptide,
+    light_heavy_chain,
+    nitrogen_collision,
+    rigid_waters,
+    water_clash,
+)
 from project_scripts import load_script
 
 ROOT = Path(__file__).parents[2]
-LENGTH = 0.0125  # nm, of the product of force and squared speed
+LENGTH, FLIGHT = 0.0125, 0.4  # nm, of the product of force and squared speed, and of free flight
+POWERS = (2 / 3, 0.8)
+DEAD_ZONE = 2.5
+KT_300 = 300 * 0.00831446  # kJ/mol
 
 
 def automatic(step: float, calibration: int | None = None, tolerance: float = 1e-8) -> VariableStepRattleIntegrator:
@@ -71,12 +82,12 @@ class Statement:
         return -self.potential(q.ravel())[1].reshape(-1, 3)
 
     def squares(self, q: Array, v: Array) -> Array:
-        """S_c from the constraint forces themselves."""
+        """S_c from the net forces themselves."""
         force = self.forces(q)
         momenta = self.c.masses[:, None] * v
         multipliers = self.c.multipliers(q.ravel(), momenta.ravel(), -force.ravel())
-        pull = (self.c.jacobian(q.ravel()).T @ multipliers).reshape(-1, 3)
-        each = np.sum(pull**2 + force**2, axis=1) / self.c.masses
+        net = force - (self.c.jacobian(q.ravel()).T @ multipliers).reshape(-1, 3)
+        each = np.sum(net**2, axis=1) / self.c.masses + self.c.masses * np.sum(v**2, axis=1) ** 2 / FLIGHT**2
         return np.array([np.sum(each[c]) for c in self.clusters])
 
     def on_step(self, q: Array, v: Array) -> float:
@@ -86,9 +97,15 @@ class Statement:
 
     def half_step(self, q0: Array, v0: Array, q1: Array, v1: Array, size: float) -> float:
         rate = np.sum((q1 - q0) / size * (self.forces(q1) - self.forces(q0)), axis=1)
-        b = 2 / size * np.abs([np.sum(rate[c]) for c in self.clusters])
+        b = 3 * 2 / size * np.abs([np.sum(rate[c]) for c in self.clusters])
         b = b + (self.squares(q0, v0) + self.squares(q1, v1)) / 2
         return float(np.sum(b**4) ** (1 / 8))
+
+    def thermal(self, v: Array, step: float) -> float:
+        """A monitor where each cluster's momentum changes by the thermal one in a step, at 300 K or more."""
+        freedoms = 3 * len(self.c.masses) - len(self.c.jacobian(np.ones(3 * len(self.c.masses))))
+        kt = max(float(np.sum(self.c.masses[:, None] * v**2)) / freedoms, KT_300)
+        return np.sqrt(kt) / step * len(self.clusters) ** (1 / 8)
 
 
 def f(x: float) -> float:
@@ -99,13 +116,18 @@ def inverse(y: float) -> float:
     return 0.75 + (y + np.sqrt(y**2 + 0.25)) / 2
 
 
-def target(u: float, reference: float, power: float) -> float:
-    phi = (1 + ((u / reference) ** power / 2) ** 16) ** (1 / 16)
-    return f(phi / (1 + (phi / 1000) ** 16) ** (1 / 16))
+def limited(rho: float, largest: float = 1000) -> float:
+    return 1 + (rho - 1) / (1 + ((rho - 1) / (largest - 1)) ** 16) ** (1 / 16) if rho > 1 else rho
 
 
-def density(a: float, b: float) -> float:
-    return float(np.sqrt((inverse(a) ** 2 + inverse(b) ** 2) / 2))
+def target(u: float, reference: float, power: float, largest: float = 1000) -> float:
+    x = (u / reference) ** power / DEAD_ZONE
+    phi = (1 + max(0, x**4 - 0.8**4) ** 4) ** (1 / 16)
+    return f(limited(phi, largest))
+
+
+def density(a: float, b: float, largest: float = 1000) -> float:
+    return limited(float(np.sqrt((inverse(a) ** 2 + inverse(b) ** 2) / 2)), largest)
 
 
 def test_f_is_inverted() -> None:
@@ -113,72 +135,96 @@ def test_f_is_inverted() -> None:
         assert inverse(f(x)) == pytest.approx(x, rel=1e-12)
 
 
-def trial_steps(model: Model, step: float, sign: float, steps: int) -> list[tuple[Array, Array]]:
-    """Positions and velocities along steps of RATTLE, forwards or backwards in time."""
-    integrator = VariableStepRattleIntegrator(step, monitors=[], constraintTolerance=1e-12)
-    context = open_context(model.system(), integrator, "Reference", model)
-    context.setVelocities(sign * model.velocities)
-    states = [(model.positions, sign * model.velocities)]
-    for _ in range(steps):
-        integrator.step(1)
-        states.append((positions_of(context), velocities_of(context)))
-    return states
+class Sequences:
+    """The recursion of the two densities, from the start on."""
+
+    def __init__(self, u_a: float, references: list[float], largest: float = 1000) -> None:
+        self.references, self.largest, self.steps = references, largest, 0
+        self.last = [target(u_a, references[0], POWERS[0], largest)] * 2
+        self.next = list(self.last)
+
+    def density(self) -> float:
+        return density(*self.next, self.largest)
+
+    def move(self, values: list[float]) -> None:
+        wanted = [target(values[k], self.references[k], POWERS[k], self.largest) for k in range(2)]
+        if self.steps < 30:
+            for k in range(2):
+                self.last[k] += 0.1 * (wanted[k] - self.last[k])
+                self.next[k] += 0.1 * (wanted[k] - self.next[k])
+        self.steps += 1
+        a, b = 2 * wanted[0] - self.next[0], 2 * wanted[1] - self.last[1]
+        self.last, self.next = self.next, [a, b]
 
 
-@pytest.mark.parametrize("make, step, range_of_steps", [(chain, 0.002, 1.5), (waters, 0.004, 1.4), (whip, 0.003, 1.3)])
+@pytest.mark.parametrize("make, step, range_of_steps", [(chain, 0.002, 1.5), (waters, 0.004, 1.3), (whip, 0.003, 1.3)])
 def test_against_an_independent_statement(make: Callable[[], Model], step: float, range_of_steps: float) -> None:
-    """Calibration, start, monitors and density of every step; and these steps are not all the same."""
-    model, calibration = make(), 7
+    """References, start, monitors and density of every step; and these steps are not all the same."""
+    model, learning = make(), 7
     statement = Statement(model)
-    integrator = automatic(step, calibration, 1e-12)
+    integrator = automatic(step, learning, 1e-12)
     context = open_context(model.system(), integrator, "Reference", model)
-    # The references: geometric means over fixed steps, from the start on.
-    states = trial_steps(model, step, 1, calibration)
-    on_step = [statement.on_step(*state) for state in states]
-    half_step = [statement.half_step(*a, *b, step) for a, b in zip(states, states[1:], strict=False)]
-    references = [float(np.exp(np.mean(np.log(each)))) for each in (on_step[1:], half_step)]
-    for _ in range(2):  # Before and after the reference values are lowered, so that something happens.
-        # The start: two steps backwards of the size of the first step.
-        first = density(target(on_step[0], references[0], 2 / 3), target(0, references[1], 0.8))
-        while True:
-            back = trial_steps(model, step / first, -1, 2)
-            on_back = [statement.on_step(*state) for state in back]
-            half_back = [statement.half_step(*a, *b, step / first) for a, b in zip(back, back[1:], strict=False)]
-            found = density(target(on_step[0], references[0], 2 / 3), target(half_back[0], references[1], 0.8))
-            if found <= 1.1 * first:
-                break
-            first = found
-        a0, a1, a2 = (target(u, references[0], 2 / 3) for u in on_back)
-        b1, b3 = (target(u, references[1], 0.8) for u in half_back)
-        last_a = (a0 + a1) / 2 - (a0 - 2 * a1 + a2) / 4
-        last_a = min(max(last_a, min(a0, a1)), max(a0, a1))
-        next_a, last_b, next_b = 2 * a0 - last_a, b1, 2 * b1 - b3
+
+    def take(expected: float) -> list[float]:
+        nonlocal q, v
+        integrator.step(1)
+        assert integrator.getStepDensity() == pytest.approx(expected, rel=1e-6)
+        size = value(integrator.getStepSize())
+        assert size == pytest.approx(step / integrator.getStepDensity(), rel=1e-12)
+        densities.append(integrator.getStepDensity())
+        new_q, new_v = positions_of(context), velocities_of(context)
+        values = [statement.on_step(new_q, new_v), statement.half_step(q, v, new_q, new_v, size)]
+        for k in range(2):
+            assert integrator.getMonitorValue(k) == pytest.approx(values[k], rel=1e-6)
+        q, v = new_q, new_v
+        return values
+
+    # The first steps are nominal ones, and the geometric means over them are the references.
+    q, v, densities = model.positions, model.velocities, []
+    found = []
+    for _ in range(learning):
+        assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == [0, 0]
+        found.append(take(1.0))
+    references = [float(r) for r in np.exp(np.mean(np.log(found), axis=0))]
+    for k in range(2):
+        assert integrator.getReferenceMonitorValue(k) == pytest.approx(references[k], rel=1e-6)
+    # With lower ones something happens.
+    for factor in (10, 30):
+        sequence = Sequences(
+            statement.on_step(model.positions, model.velocities), [each / factor for each in references]
+        )
+        for k in range(2):
+            integrator.setReferenceMonitorValue(sequence.references[k], k)
         context.setPositions(model.positions)
         context.setVelocities(model.velocities)
-        q, v = model.positions, model.velocities
-        densities = []
+        q, v, densities = model.positions, model.velocities, []
         for _ in range(60):
-            integrator.step(1)
-            size = value(integrator.getStepSize())
-            assert integrator.getStepDensity() == pytest.approx(density(next_a, next_b), rel=1e-6)
-            assert size == pytest.approx(step / integrator.getStepDensity(), rel=1e-12)
-            densities.append(integrator.getStepDensity())
-            new_q, new_v = positions_of(context), velocities_of(context)
-            u_a, u_b = statement.on_step(new_q, new_v), statement.half_step(q, v, new_q, new_v, size)
-            assert integrator.getMonitorValue(0) == pytest.approx(u_a, rel=1e-7)
-            assert integrator.getMonitorValue(1) == pytest.approx(u_b, rel=1e-6)
-            last_a, next_a = next_a, 2 * target(u_a, references[0], 2 / 3) - next_a
-            last_b, next_b = next_b, 2 * target(u_b, references[1], 0.8) - last_b
-            q, v = new_q, new_v
-        for k in range(2):
-            assert integrator.getReferenceMonitorValue(k) == pytest.approx(references[k], rel=1e-6)
-            references[k] /= 10
-            integrator.setReferenceMonitorValue(references[k], k)
+            sequence.move(take(sequence.density()))
     assert max(densities) / min(densities) > range_of_steps
 
 
+def test_a_clash_is_seen_at_once() -> None:
+    """References in thermal units, from the first step on; and they stay."""
+    test = water_clash()
+    model = model_of(test)
+    statement = Statement(model)
+    step = 0.001
+    u_a, unit_of_u = statement.on_step(model.positions, model.velocities), statement.thermal(model.velocities, step)
+    assert u_a > 8 * unit_of_u
+    integrator = automatic(step, tolerance=1e-12)
+    context = open_context(test.system, integrator, "Reference", test)
+    integrator.step(1)
+    sequence = Sequences(u_a, [0.4 * unit_of_u] * 2)
+    assert integrator.getStepDensity() == pytest.approx(sequence.density(), rel=1e-6)
+    assert integrator.getStepDensity() > 10
+    integrator.step(300)
+    for k in range(2):
+        assert integrator.getReferenceMonitorValue(k) == pytest.approx(0.4 * unit_of_u, rel=1e-6)
+    assert time_of(context) > 0.01
+
+
 def test_half_step_monitor_is_a_second_derivative() -> None:
-    """On free particles without constraints, 2/dt w.(F1 - F0) is minus twice the change of V twice differentiated."""
+    """On free particles without constraints, 6/dt w.(F1 - F0) is minus six times what V differentiated twice has."""
     system = openmm.System()
     spring = openmm.CustomExternalForce("50*x^2+20*y^2+x*y*z")
     for mass in (1.0, 30.0):
@@ -195,7 +241,7 @@ def test_half_step_monitor_is_a_second_derivative() -> None:
     for (x, y, z), speed, mass in zip(q, v, (1.0, 30.0), strict=True):
         hessian = np.array([[100, z, y], [z, 40, x], [y, x, 0]])
         force = -np.array([100 * x + y * z, 40 * y + x * z, x * y])
-        b.append(2 * abs(speed @ hessian @ speed) + force @ force / mass)
+        b.append(6 * abs(speed @ hessian @ speed) + force @ force / mass + mass * (speed @ speed) ** 2 / FLIGHT**2)
     assert integrator.getMonitorValue(1) == pytest.approx(np.sum(np.array(b) ** 4) ** (1 / 8), rel=1e-3)
 
 
@@ -237,9 +283,10 @@ def test_a_run_that_is_turned_round_comes_back(
     make: Callable[[], Model], step: float, least_ratio: float, platform: str
 ) -> None:
     model = make()
-    integrator = automatic(step, 200, 1e-13)
+    integrator = automatic(step, tolerance=1e-13)
     context = open_context(model.system(), integrator, platform, model)
     densities = densities_of(integrator, 1000)
+    assert integrator.getNumForceEvaluations() == 1001
     assert densities.max() / densities.min() >= least_ratio
     turning_point, evaluations = positions_of(context), integrator.getNumForceEvaluations()
     assert np.max(np.abs(turning_point - model.positions)) > 0.05
@@ -353,35 +400,37 @@ def counted(model: Model) -> tuple[openmm.System, list[int]]:
 
 
 def test_one_evaluation_a_step(platform: str) -> None:
-    """After the start, which costs the calibration, two steps backwards and the forces themselves."""
+    """And one more at the start, whatever is learnt on the way."""
     model = waters()
     system, calls = counted(model)
     integrator = automatic(0.001, 25)
     context = open_context(system, integrator, platform, model)
-    state = context.getState(positions=True, velocities=True)
     calls[0] = 0
     integrator.step(1)
-    assert calls[0] == 1 + 25 + 2 + 1 == integrator.getNumForceEvaluations()
+    assert calls[0] == 2 == integrator.getNumForceEvaluations()
     integrator.step(200)
-    assert calls[0] == 29 + 200 == integrator.getNumForceEvaluations()
-    # The calibration has left no trace: with its values given, the run is the same.
-    other = automatic(0.001, 1000)
-    for k in range(2):
-        other.setReferenceMonitorValue(integrator.getReferenceMonitorValue(k), k)
+    assert calls[0] == 202 == integrator.getNumForceEvaluations()
+    # Calm steps are those of fixed steps.
+    np.testing.assert_array_equal(densities_of(integrator, 100), 1.0)
+    other = VariableStepRattleIntegrator(0.001, monitors=[])
     again = open_context(system, other, platform, model)
-    assert np.array_equal(positions_of(again), state.getPositions(asNumpy=True)._value)
-    other.step(201)
-    np.testing.assert_array_equal(positions_of(again), positions_of(context))
-    assert other.getNumForceEvaluations() == 1 + 2 + 201
+    other.step(301)
+    np.testing.assert_allclose(
+        positions_of(again), positions_of(context), rtol=0, atol=1e-6 if platform == "Reference" else 1e-3
+    )
 
 
-def test_a_change_by_the_user_costs_the_start() -> None:
-    """References stay; the densities start anew with two steps backwards, and forces at the new state."""
+def test_a_change_by_the_user_costs_the_forces() -> None:
+    """References stay, unless there are much larger velocities."""
     model = waters()
     integrator = automatic(0.001, 25)
     context = open_context(model.system(), integrator, "Reference", model)
-    integrator.step(5)
-    references = [integrator.getReferenceMonitorValue(k) for k in range(2)]
+    integrator.step(30)
+
+    def references() -> list[float]:
+        return [integrator.getReferenceMonitorValue(k) for k in range(2)]
+
+    before_changes = references()
     changes: list[Callable[[], Any]] = [
         lambda: context.setVelocities(velocities_of(context)),
         lambda: context.setPositions(positions_of(context)),
@@ -391,16 +440,25 @@ def test_a_change_by_the_user_costs_the_start() -> None:
         change()
         before = integrator.getNumForceEvaluations()
         integrator.step(5)
-        assert integrator.getNumForceEvaluations() == before + 1 + 2 + 5
-        assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == references
+        assert integrator.getNumForceEvaluations() == before + 1 + 5
+        assert references() == before_changes
+    context.setVelocities(1.4 * velocities_of(context))
+    integrator.step(1)
+    assert references() == before_changes
+    context.setVelocities(3 * velocities_of(context))
+    integrator.step(1)
+    assert references() == [0, 0]
+    integrator.step(25)
+    assert all(new > old for new, old in zip(references(), before_changes, strict=True))
+    before = integrator.getNumForceEvaluations()
     integrator.useAutomaticStepControl(10)
-    before = integrator.getNumForceEvaluations()
     integrator.step(5)
-    assert integrator.getNumForceEvaluations() == before + 10 + 2 + 5
-    assert [integrator.getReferenceMonitorValue(k) for k in range(2)] != references
-    before = integrator.getNumForceEvaluations()
-    integrator.calibrate(10)
+    assert references() == [0, 0]
+    integrator.step(5)
+    assert min(references()) > 0
     assert integrator.getNumForceEvaluations() == before + 10
+    integrator.calibrate(10)
+    assert integrator.getNumForceEvaluations() == before + 20
 
 
 def test_a_parameter_renews_the_forces() -> None:
@@ -425,7 +483,7 @@ def test_a_parameter_renews_the_forces() -> None:
     other.setPositions(position)
     other.setVelocities(velocity)
     fresh.step(20)
-    np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("make, step", [(waters, 0.001), (whip, 0.003)])
@@ -466,7 +524,7 @@ def test_a_state_goes_on() -> None:
     another = open_context(model.system(), other, "Reference")
     another.setState(state)
     np.testing.assert_allclose(densities_of(other, 100), expected, rtol=1e-9)
-    assert other.getNumForceEvaluations() <= 102  # No calibration, no start.
+    assert other.getNumForceEvaluations() <= 102
     np.testing.assert_allclose(positions_of(another), positions_of(context), rtol=0, atol=1e-9)
 
 
@@ -534,7 +592,7 @@ def test_a_thermostat_does_not_make_it_slower() -> None:
 
     densities, temperatures, evaluations = run_with(waters(), andersen, 5000)
     print(f"mean density {densities.mean():.4f}, largest {densities.max():.3f}, {temperatures[1000:].mean():.0f} K")
-    assert evaluations == 103 + 5000
+    assert evaluations == 1 + 5000
     assert np.abs(densities - 1).max() < 0.01
     # 48 freedoms, about 80 independent samples.
     assert temperatures[1000:].mean() == pytest.approx(300, abs=30)
@@ -628,23 +686,222 @@ def test_without_constraints(platform: str) -> None:
 # --------------------------------------------------------------------------------------------------------- errors
 
 
-def test_a_system_in_which_nothing_happens_is_named() -> None:
+def test_a_system_in_which_nothing_happens_runs() -> None:
+    """An ideal gas, at rest and in flight; and a rotor, whose forces do not vary."""
     system = openmm.System()
     for _ in range(2):
         system.addParticle(14.0)
     system.addConstraint(0, 1, 0.11)
-    integrator = automatic(0.001, 10)
-    context = open_context(system, integrator, "Reference")
-    context.setPositions([[0, 0, 0], [0.11, 0, 0]])
-    for velocities in (np.zeros((2, 3)), np.full((2, 3), 0.7)):
+    for velocities in (np.zeros((2, 3)), np.full((2, 3), 0.7), np.array([[0, 1, 0.3], [0, -1, 0.3]])):
+        integrator = automatic(0.001, 10)
+        context = open_context(system, integrator, "Reference")
+        context.setPositions([[0, 0, 0], [0.11, 0, 0]])
         context.setVelocities(velocities)
-        with pytest.raises(openmm.OpenMMException, match=r"no force and nothing turns.*clearMonitors"):
+        np.testing.assert_array_equal(densities_of(integrator, 100), 1.0)
+        known = [integrator.getReferenceMonitorValue(k) > 0 for k in range(2)]
+        assert known == [bool(np.any(velocities))] * 2
+        assert time_of(context) == pytest.approx(0.1)
+
+
+def test_references_are_found_as_soon_as_there_is_something() -> None:
+    """Two atoms at rest, until a field is switched on."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("e*x^2")
+    field.addGlobalParameter("e", 0.0)
+    for _ in range(2):
+        field.addParticle(system.addParticle(14.0))
+    system.addForce(field)
+    integrator = automatic(0.001)
+    context = open_context(system, integrator, "Reference")
+    context.setPositions([[0.1, 0, 0], [0.3, 0, 0]])
+    integrator.step(200)
+    assert integrator.getReferenceMonitorValue(0) == 0
+    np.testing.assert_array_equal(positions_of(context), [[0.1, 0, 0], [0.3, 0, 0]])
+    context.setParameter("e", 100.0)
+    densities = densities_of(integrator, 1000)
+    assert integrator.getReferenceMonitorValue(0) > 0
+    assert densities.mean() < 1.5
+
+
+def test_dilute_gas_costs_little() -> None:
+    """Two argon atoms, three diameters apart or more, with a step of 4 fs that is right for them."""
+    for distance in (1.0, 3.0):
+        steps, errors = [], []
+        for is_automatic in (True, False):
+            system = openmm.System()
+            force = openmm.NonbondedForce()
+            for _ in range(2):
+                force.addParticle(0, 0.33, 0.99)
+                system.addParticle(39.9)
+            system.addForce(force)
+            integrator = automatic(0.004) if is_automatic else VariableStepRattleIntegrator(0.004, monitors=[])
+            context = open_context(system, integrator, "Reference")
+            context.setPositions([[-distance / 2, -0.02, 0], [distance / 2, 0.02, 0]])
+            context.setVelocities([[0.25, 0, 0], [-0.25, 0, 0]])
+            start, worst, count = energy_of(context), 0.0, 0
+            while time_of(context) < 2 * distance + 3:
+                integrator.step(1)
+                count += 1
+                worst = max(worst, abs(energy_of(context) - start))
+            steps.append(count)
+            errors.append(worst)
+        print(f"{distance} nm: {steps} steps, largest errors {errors}")
+        assert steps[0] < 2 * steps[1]
+        assert errors[0] <= errors[1]
+
+
+@pytest.mark.parametrize("rate", [1, 20])
+def test_a_cold_start_is_no_trap(rate: float) -> None:
+    """Minimised and at rest, and warmed by a thermostat: after 1 ps the pace is the nominal one."""
+    test = alanine_dipeptide()
+    minimizer = openmm.VerletIntegrator(0.001)
+    context = open_context(test.system, minimizer, "Reference", test)
+    openmm.LocalEnergyMinimizer.minimize(context, 1e-3)
+    positions = positions_of(context)
+    system = copy.deepcopy(test.system)
+    thermostat = openmm.AndersenThermostat(300, rate)
+    thermostat.setRandomNumberSeed(5)
+    system.addForce(thermostat)
+    integrator = automatic(0.001)
+    context = open_context(system, integrator, "Reference")
+    context.setPositions(positions)
+    while time_of(context) < 1:
+        integrator.step(10)
+    assert context.getStepCount() < 2000
+    before = time_of(context)
+    integrator.step(1000)
+    assert time_of(context) - before == pytest.approx(1.0, rel=0.01)
+
+
+def test_a_cold_spring_is_no_trap() -> None:
+    """Two atoms exactly at the minimum of their bond: all that there is are kicks, now and then."""
+    system = openmm.System()
+    bond = openmm.HarmonicBondForce()
+    for mass in (12.0, 16.0):
+        system.addParticle(mass)
+    bond.addBond(0, 1, 0.12, 300000.0)
+    system.addForce(bond)
+    thermostat = openmm.AndersenThermostat(300, 1)
+    thermostat.setRandomNumberSeed(5)
+    system.addForce(thermostat)
+    integrator = automatic(0.001)
+    context = open_context(system, integrator, "Reference")
+    context.setPositions([[0, 0, 0], [0.12, 0, 0]])
+    integrator.step(5000)
+    assert time_of(context) > 4.9
+
+
+def test_references_follow_where_forces_change_the_state_and_only_there() -> None:
+    """From a fifth of what is right they come back with a thermostat; without one they stay."""
+    model = waters()
+    for with_thermostat in (True, False):
+        system = model.system()
+        thermostat = openmm.AndersenThermostat(300, 20 if with_thermostat else 0)
+        thermostat.setRandomNumberSeed(3)
+        system.addForce(thermostat)
+        integrator = automatic(0.001)
+        context = open_context(system, integrator, "Reference", model)
+        integrator.step(2000)
+        right = [integrator.getReferenceMonitorValue(k) for k in range(2)]
+        integrator.step(500)
+        now = [integrator.getReferenceMonitorValue(k) for k in range(2)]
+        assert (now != right) == with_thermostat
+        for k in range(2):
+            assert 0.4 < now[k] / right[k] < 2.5
+        del context
+    # The user's own stay also with a thermostat.
+    system.getForce(system.getNumForces() - 1).setDefaultCollisionFrequency(20)
+    integrator = automatic(0.001)
+    for k in range(2):
+        integrator.setReferenceMonitorValue(1e4, k)
+    context = open_context(system, integrator, "Reference", model)
+    integrator.step(200)
+    assert context.getStepCount() == 200
+    assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == [1e4, 1e4]
+
+
+def test_no_step_is_below_the_minimum() -> None:
+    """By default a thousandth of the nominal step; and settable."""
+    test = water_clash()
+    for minimum in (None, 0.0004, 0.0009):
+        integrator = automatic(0.001)
+        assert value(integrator.getMinimumStepSize()) == pytest.approx(1e-6)
+        for k in range(2):
+            integrator.setReferenceMonitorValue(0.01, k)  # everything is hard
+        if minimum is not None:
+            integrator.setMinimumStepSize(minimum)
+            assert value(integrator.getMinimumStepSize()) == minimum
+        context = open_context(test.system, integrator, "Reference", test)
+        sizes = []
+        for _ in range(50):
             integrator.step(1)
-        np.testing.assert_array_equal(positions_of(context), [[0, 0, 0], [0.11, 0, 0]])
-    # A rotor in free flight has constraint forces, which do not vary: fixed steps.
-    context.setVelocities([[0, 1, 0.3], [0, -1, 0.3]])
-    np.testing.assert_allclose(densities_of(integrator, 100), 1, rtol=1e-5)
-    np.testing.assert_allclose(densities_of(integrator, 100), integrator.getStepDensity(), rtol=1e-6)
+            sizes.append(value(integrator.getStepSize()))
+        least = minimum or 1e-6
+        assert least * (1 - 1e-12) <= min(sizes) < 1.05 * least
+        del context
+    # Calm steps stay what they are.
+    integrator = automatic(0.001)
+    integrator.setMinimumStepSize(0.0009)
+    context = open_context(rigid_waters(8).system, integrator, "Reference", rigid_waters(8))
+    np.testing.assert_array_equal(densities_of(integrator, 50), 1.0)
+    with pytest.raises(openmm.OpenMMException, match=r"minimum step size .* must be smaller than the nominal"):
+        integrator.setMinimumStepSize(0.002)
+        integrator.step(1)
+    assert VariableStepRattleIntegrator(0.001, automatic=True, minimumStepSize=1e-5).getMinimumStepSize()._value == 1e-5
+    del context
+
+
+def test_a_run_that_crawls_says_so_once() -> None:
+    test = rigid_waters(8)
+    integrator = automatic(0.001)
+    context = open_context(test.system, integrator, "Reference", test)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        integrator.step(50)
+        for k in range(2):
+            integrator.setReferenceMonitorValue(integrator.getReferenceMonitorValue(k) / 200, k)
+        integrator.step(900)
+    assert 800 < integrator.getNumShortSteps() <= 900
+    with pytest.warns(UserWarning, match="1000 steps in a row that are shorter than a tenth"):
+        integrator.step(200)
+    checkpoint = context.createCheckpoint()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        integrator.step(100)
+    most = integrator.getNumShortSteps()
+    context.loadCheckpoint(checkpoint)
+    integrator.step(100)
+    assert integrator.getNumShortSteps() == most
+
+
+def test_a_checkpoint_in_the_first_steps() -> None:
+    """What has been learnt so far is part of it."""
+    model = waters()
+    integrator = automatic(0.001)
+    context = open_context(model.system(), integrator, "Reference", model)
+    integrator.step(13)
+    checkpoint = context.createCheckpoint()
+    integrator.step(20)
+    references = [integrator.getReferenceMonitorValue(k) for k in range(2)]
+    assert min(references) > 0
+    context.loadCheckpoint(checkpoint)
+    assert integrator.getReferenceMonitorValue(0) == 0
+    integrator.step(20)
+    assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == references
+
+
+def test_velocities_set_after_a_start_at_rest() -> None:
+    """References of a frozen state do not slow down what is warm."""
+    test = alanine_dipeptide()
+    context = open_context(test.system, openmm.VerletIntegrator(0.001), "Reference", test)
+    openmm.LocalEnergyMinimizer.minimize(context, 1e-3)
+    positions = positions_of(context)
+    integrator = automatic(0.001)
+    context = open_context(test.system, integrator, "Reference")
+    context.setPositions(positions)
+    integrator.step(100)
+    context.setVelocities(test.velocities)
+    assert densities_of(integrator, 1000).mean() < 1.01
 
 
 def test_wrong_arguments() -> None:
@@ -674,12 +931,13 @@ def test_a_calibration_that_fails_takes_shorter_steps() -> None:
     test = light_heavy_chain()
     integrator = automatic(0.05, 100)
     context = open_context(test.system, integrator, "Reference", test)
-    integrator.step(50)
-    assert integrator.getNumForceEvaluations() > 200
+    integrator.calibrate(100)
+    assert integrator.getNumForceEvaluations() > 101
+    assert min(integrator.getReferenceMonitorValue(k) for k in range(2)) > 0
     hopeless = automatic(1e3, 10)
     context = open_context(test.system, hopeless, "Reference", test)
-    with pytest.raises(openmm.OpenMMException, match=r"trial run of automatic step control.*smaller step size"):
-        hopeless.step(1)
+    with pytest.raises(openmm.OpenMMException, match=r"calibrate\(\).*smaller step size"):
+        hopeless.calibrate(10)
     np.testing.assert_array_equal(positions_of(context), test.positions)
 
 
@@ -698,14 +956,13 @@ def test_the_benchmark_runs(benchmark: ModuleType, tmp_path: Path, capsys: pytes
     assert [r["system"] for r in results] == ["whip", "whip", "8 waters", "8 waters"]
     for result in results:
         assert result["gain"] > 0.5
-        assert 0 < result["counted_gain"] < result["gain"]
     assert "| whip |" in capsys.readouterr().out
     for name in ("gains.png", "monitors.png"):
         assert (tmp_path / name).read_bytes()[1:4] == b"PNG"
 
 
 def test_the_benchmark_finds_a_loss(benchmark: ModuleType) -> None:
-    good, bad = (benchmark.Run(1000, 302, error, 0.001, 1.0) for error in (1.0, 1.2))
+    good, bad = (benchmark.Run(1000, error, 0.001, 1.0) for error in (1.0, 1.2))
     whip, water = benchmark.PROBLEMS["whip"], benchmark.PROBLEMS["8 waters"]
     assert benchmark.faults([benchmark.summary(water, 1000, [(bad, good), (good, good)])]) == []
     assert len(benchmark.faults([benchmark.summary(water, 1000, [(good, bad), (good, good)])])) == 1
@@ -714,7 +971,7 @@ def test_the_benchmark_finds_a_loss(benchmark: ModuleType) -> None:
 
 def test_the_documentation_claims_what_was_measured(benchmark: ModuleType) -> None:
     """Every system of the benchmark is in the table, twice, with a gain not below its claim."""
-    page = (ROOT / "docs" / "automatic.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "automatic_benchmark.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (.+?) \| ([\d,]+) \| ([\d.e+,]+) \|", page, re.MULTILINE)
     for name, problem in benchmark.PROBLEMS.items():
         gains = [float(gain.replace(",", "")) for system, _, gain in rows if system == name]

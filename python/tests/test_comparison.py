@@ -92,9 +92,7 @@ def test_all_integrators_run(pendulum):
 def test_force_evaluations_are_equal(pendulum):
     for run in pendulum.runs:
         assert run.force_evaluations == pytest.approx(15_000, rel=0.02), run.name
-        # The automatic step control has trial steps before the first step: 300, and three at the start itself.
-        trial_steps = 303 if run.name == "VRATTLE, automatic" else 1
-        assert 0 <= run.force_evaluations - run.steps <= trial_steps, run.name
+        assert 0 <= run.force_evaluations - run.steps <= 1, run.name
 
 
 def test_same_time_and_same_start(pendulum):

@@ -65,14 +65,14 @@ def test_quick_run(drift: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixt
         # Tuned on trial runs that are as short.
         assert variable["mean_step"] == pytest.approx(ours[0]["mean_step"], rel=0.15)
         for run in system:
-            # One evaluation a step, and one more where a run of ours begins; automatic control has trial steps besides.
-            at_start = 303 if run["integrator"] == "VRATTLE automatic" else 1
-            assert 0 <= run["force_evaluations"] - run["starts"] * run["steps"] <= at_start * run["starts"]
+            # One evaluation a step, and one more where a run of ours begins.
+            assert 0 <= run["force_evaluations"] - run["starts"] * run["steps"] <= run["starts"]
         for run in ours:
             assert run["constraint_error"] <= 1e-8
-            assert run["smallest_step"] < run["largest_step"]
             if run["integrator"] == "VRATTLE automatic":  # calm all the time
                 assert run["mean_step"] == pytest.approx(verlet["mean_step"], rel=1e-3)
+            else:
+                assert run["smallest_step"] < run["largest_step"]
             assert run["rescues"] == 0
             # Within one sample of the other's: they conserve energy alike.
             assert run["fluctuation"] <= 2 * verlet["fluctuation"] + 1e-3

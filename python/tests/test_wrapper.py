@@ -162,7 +162,7 @@ def test_defaults_in_signatures():
     assert defaults(VariableStepRattleIntegrator.getReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.setReferenceMonitorValue) == {"index": 0}
     assert defaults(VariableStepRattleIntegrator.getMonitorValue) == {"index": 0}
-    assert defaults(VariableStepRattleIntegrator.useAutomaticStepControl) == {"calibrationSteps": 300}
+    assert defaults(VariableStepRattleIntegrator.useAutomaticStepControl) == {"calibrationSteps": 30}
 
 
 @pytest.mark.parametrize("name, value", [*UPDATE_METHODS.items(), *MONITOR_KINDS.items()])

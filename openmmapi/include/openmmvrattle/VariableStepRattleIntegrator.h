@@ -42,8 +42,8 @@ struct RunState;
  * Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run, and after each
  * change of the state by the user or by a Force that moves particles (a barostat), or of the parameters of a Force; one more where the first step is taken with a given
  * reference value, since that step is then taken twice; one after loading a checkpoint or a State, to compare the forces with the
- * saved ones; and the trial steps of calibrate() and of automatic step control. A monitor ForceGroupEnergy costs the energy
- * of its group on top of each. getNumForceEvaluations() counts all.
+ * saved ones; and the trial steps of calibrate(). A monitor ForceGroupEnergy costs the energy of its group on top of each.
+ * getNumForceEvaluations() counts all.
  *
  * The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to
  * the tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
@@ -141,7 +141,8 @@ public:
     /**
      * Set the smallest step size the monitor can ask for. With the sum updates SemiExplicit and Explicit, rho
      * oscillates slightly about u and steps may leave the bounds by as much; where the motion is not resolved they may
-     * leave them by more. Default: 1/50 of the nominal step size.
+     * leave them by more. With automatic step control no step is ever smaller. Default: 1/50 of the nominal step size, and 1/1000
+     * with automatic step control.
      *
      * @param size    the bound in ps; 0 means no bound. It must be smaller than the nominal step size when the next step is taken
      */
@@ -204,28 +205,29 @@ public:
      * Let the integrator choose its steps by itself: the setting for most uses. It takes steps of the nominal size while nothing
      * out of the ordinary happens, and shorter ones when something does, by two monitors of its own (docs/automatic.md):
      *
-     * - 0, U_A, on each step: the size of the constraint and applied forces of the hardest clusters of particles, and of
-     *   the forces times the squared speeds, in nm amu^(1/2)/ps^2;
+     * - 0, U_A, on each step: the size of the net force, applied and of constraints, of the hardest clusters of particles, and
+     *   of the applied forces times the squared speeds, in nm amu^(1/2)/ps^2;
      * - 1, U_B, of each step between: from the change of the forces along it, the second time derivative of the potential
      *   energy, in the same unit.
      *
-     * They take the place of the monitors, which are removed, and of the update and the bounds, which have no effect
-     * then: no step is ever larger than 4/3 of the nominal one. clearMonitors() and addMonitor() end it. getMonitorValue(),
+     * They take the place of the monitors, which are removed, and of the update and the maximum step size, which have no effect
+     * then: no step is ever larger than 4/3 of the nominal one, and none smaller than the minimum step size, by default
+     * 1/1000 of the nominal one. clearMonitors() and addMonitor() end it. getMonitorValue(),
      * getReferenceMonitorValue() and setReferenceMonitorValue() have the indices 0 and 1.
      *
-     * The first step is preceded by a trial run of fixed steps of the nominal size from the state at that time, which
-     * leaves the Context as it was. The geometric means of the monitors over it become their reference values, unless
-     * these have been set. They stay in force when the state is changed later; calling this again, or calibrate(),
-     * takes new ones. Take them where the forces are typical: a reference value that is too small makes steps
-     * shorter than they need be. Each start, also after positions, velocities or parameters have been changed, takes two trial
-     * steps more. All trial steps count as evaluations of the forces.
+     * The first steps have the nominal size, and the geometric means of the monitors over them become their reference values,
+     * unless these have been set; getReferenceMonitorValue() is 0 until then. Steps in which nothing moves and nothing pulls do not
+     * count. A start in a clash is seen at once. At constant energy the reference values then stay what they are, so that the run is
+     * reversible; where Forces change the state (a thermostat, a barostat) they follow it, and where velocities are set that
+     * are more than twice as large (four times the kinetic energy) they are found anew, as when this is called again. No step costs
+     * more than one evaluation of the forces. See also getNumShortSteps().
      *
-     * @param calibrationSteps    the number of trial steps, at least 1. Default: 300
+     * @param calibrationSteps    the number of first steps that the reference values are found from, at least 1. Default: 30
      */
-    void useAutomaticStepControl(int calibrationSteps = 300);
+    void useAutomaticStepControl(int calibrationSteps = 30);
     /** Get whether the automatic step control is in use. */
     bool isAutomatic() const;
-    /** Get the number of trial steps of the automatic step control, as it was set last. */
+    /** Get from how many first steps the automatic step control finds its reference values, as it was set last. */
     int getCalibrationSteps() const;
     /**
      * Get the order of norms that addMonitor() gives to monitors that are added without one.
@@ -326,6 +328,12 @@ public:
      * grows says that the nominal step size is too large.
      */
     long long getNumRescues() const;
+    /**
+     * Get the most steps in a row that automatic step control has made shorter than a tenth of the nominal size since the Context
+     * was created. In Python a warning says so once they are 1000: something is hard all the time, or the reference values belong to
+     * calmer times, and then useAutomaticStepControl() finds new ones.
+     */
+    long long getNumShortSteps() const;
     /**
      * Set the relative tolerance of the constraints. Default: 1e-8.
      *

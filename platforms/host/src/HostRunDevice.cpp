@@ -93,6 +93,7 @@ void HostRunDevice::setSettings(const IntegratorSettings& from) {
     to.isFixedStep = false;
     to.isAutomatic = from.isAutomatic;
     to.automaticRequest = from.automaticRequest;
+    to.calibrationSteps = from.calibrationSteps;
     if (from.isAutomatic)
         std::copy(std::begin(from.automaticReferences), std::end(from.automaticReferences), to.automaticReferences);
     dynamics->setSettings(to);
@@ -289,10 +290,6 @@ void HostRunDevice::copyMoving(const Vectors& from, Vectors& to) const {
 
 // ----------------------------------------------------------------------------------------------------------- the steps
 
-bool HostRunDevice::hasStarted() {
-    return dynamics->hasStarted();
-}
-
 // One step of the method in the Context, the velocities excepted. Forces see the time of its end.
 double HostRunDevice::advance(double maxTime, double direction) {
     const double time = vectors->getTime(), maxStep = maxTime - time;
@@ -324,7 +321,6 @@ void HostRunDevice::step(double maxTime) {
     lastStep.density = dynamics->getDensity();
     writeMovingVelocities(dynamics->getVelocities());
     ahead.reset();
-    beforeDensities.reset();
 }
 
 void HostRunDevice::settle() {
@@ -440,22 +436,11 @@ long long HostRunDevice::getNumRescues() {
 }
 
 double HostRunDevice::getNegligibleValue() {
-    return dynamics->getAutomaticControl().getNegligibleValue(dynamics->getVelocities());
+    return dynamics->getAutomaticControl().getNegligibleValue();
 }
 
-double HostRunDevice::densityOf(const vector<double>& values) {
-    return dynamics->getAutomaticControl().densityOf({values[0], values[1]});
-}
-
-void HostRunDevice::startDensities(const vector<double>& back, const vector<double>& secondBack) {
-    beforeDensities = std::make_unique<VRattleDynamics::Kept>(dynamics->keep());
-    dynamics->startAutomatic({back[0], back[1]}, {secondBack[0], secondBack[1]});
-}
-
-void HostRunDevice::undoStartDensities() {
-    if (beforeDensities != nullptr)
-        dynamics->putBack(*beforeDensities);
-    beforeDensities.reset();
+long long HostRunDevice::getNumShortSteps() {
+    return (long long) dynamics->getAutomaticControl().getMemory().mostShortSteps;
 }
 
 // ------------------------------------------------------------------------------------------------- saving and resuming
@@ -481,6 +466,9 @@ void HostRunDevice::save(RunState& run) {
         run.methodValues["automaticAhead"] = {std::begin(control.ahead), std::end(control.ahead)};
         run.methodValues["automaticValues"] = {std::begin(control.values), std::end(control.values)};
         run.methodValues["automaticForceSquares"] = control.forceSquares;
+        run.methodValues["automaticLearning"] = {control.stepsSinceStart, control.numLearnt,   control.logarithms[0],
+                                                 control.logarithms[1],   control.temperature, control.following};
+        run.methodValues["automaticShortSteps"] = {control.shortSteps, control.mostShortSteps};
     }
     run.forces = dynamics->getForces();
     run.groupEnergy = dynamics->getGroupEnergy();
@@ -522,6 +510,14 @@ VRattleDynamics::Memory HostRunDevice::memoryOf(const RunState& run, const Integ
         std::copy_n(run.getMethodValues("automaticValues", numMonitors).begin(), numMonitors, control.values);
         control.forceSquares = run.getMethodValues("automaticForceSquares",
                                                    dynamics->getAutomaticControl().getMemory().forceSquares.size());
+        const vector<double>& learning = run.getMethodValues("automaticLearning", 6);
+        control.stepsSinceStart = learning[0];
+        control.numLearnt = learning[1];
+        std::copy_n(&learning[2], numMonitors, control.logarithms);
+        control.temperature = learning[4];
+        control.following = learning[5];
+        control.shortSteps = run.getMethodValues("automaticShortSteps", 2)[0];
+        control.mostShortSteps = run.getMethodValues("automaticShortSteps", 2)[1];
     }
     return memory;
 }

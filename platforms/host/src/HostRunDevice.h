@@ -39,7 +39,6 @@ public:
     void changeVelocities() override;
     void writeVelocities() override;
     void changeForces() override;
-    bool hasStarted() override;
     void step(double maxTime) override;
     void settle() override;
     void reverse() override;
@@ -56,9 +55,7 @@ public:
     long long getNumSolverIterations() override;
     long long getNumRescues() override;
     double getNegligibleValue() override;
-    double densityOf(const std::vector<double>& values) override;
-    void startDensities(const std::vector<double>& back, const std::vector<double>& secondBack) override;
-    void undoStartDensities() override;
+    long long getNumShortSteps() override;
     void save(RunState& run) override;
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
@@ -102,7 +99,6 @@ protected:
         double time, direction;
     };
     std::unique_ptr<Trial> trial;
-    std::unique_ptr<VRattleDynamics::Kept> beforeDensities; // until a step is complete
 };
 
 } // namespace OpenMMVRattle

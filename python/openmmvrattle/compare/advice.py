@@ -216,7 +216,7 @@ class Advice:
             lines.append(
                 f"Use fixed steps: nothing promises a gain. The largest P is {two_digits(self.largest_predictor)}."
             )
-            lines.append("useAutomaticStepControl() would hardly ever leave them here, and costs its calibration.")
+            lines.append("useAutomaticStepControl() would hardly ever leave them here.")
         return lines
 
     @property

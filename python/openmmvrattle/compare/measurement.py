@@ -121,8 +121,6 @@ class Method:
     """Whether the first guess gives the wanted number of steps, as a fixed step does."""
     calibration_steps: int = 0
     """Trial steps before the run, which count as force evaluations."""
-    automatic_trial_steps: int = 0
-    """Trial steps that the integrator takes by itself at the first step, which count as well."""
     update_method: str | None = None
     """The recursion of the step density, where there is one."""
 
@@ -142,10 +140,9 @@ def _rattle(settings: ComparisonSettings) -> list[Method]:
 
 
 def _automatic(settings: ComparisonSettings) -> list[Method]:
-    steps = max(10, min(300, settings.force_evaluations // 16))
-    control = StepControl(monitors=(), nominal_step_size=_mean_step(settings), automatic_trial_steps=steps)
+    control = StepControl(monitors=(), nominal_step_size=_mean_step(settings), automatic=True)
     make = functools.partial(make_integrator, control)
-    return [Method(control.label, "vrattle", make, control.nominal_step_size, -1.0, automatic_trial_steps=steps)]
+    return [Method(control.label, "vrattle", make, control.nominal_step_size, -1.0)]
 
 
 def _vrattle(settings: ComparisonSettings) -> list[Method]:
@@ -234,8 +231,8 @@ def make_integrator(
     """
     nominal = control.nominal_step_size if nominal_step_size is None else nominal_step_size
     integrator = kind(nominal)
-    if control.automatic_trial_steps:
-        integrator.useAutomaticStepControl(control.automatic_trial_steps)
+    if control.automatic:
+        integrator.useAutomaticStepControl()
         return integrator
     integrator.clearMonitors()
     for monitor in control.monitors:
@@ -438,7 +435,7 @@ def _count_steps(
         steps += 1
     del context
     needed = steps if simulated >= _end_of(settings) else steps * settings.total_time / simulated
-    return needed + method.calibration_steps + method.automatic_trial_steps
+    return needed + method.calibration_steps
 
 
 def _measure(

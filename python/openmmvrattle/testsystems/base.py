@@ -46,13 +46,13 @@ class StepControl:
     """Trial steps from which the reference value is taken (``calibrate``); 0 for the value at the first step."""
     reference_values: tuple[float, ...] = ()
     """Reference values of the monitors, in their units, if they are known beforehand."""
-    automatic_trial_steps: int = 0
-    """Trial steps of the automatic step control, which takes the place of monitors, bounds and update; 0 for none."""
+    automatic: bool = False
+    """Automatic step control, which takes the place of monitors, bounds and update."""
 
     @property
     def label(self) -> str:
         """A short name for tables and pictures."""
-        if self.automatic_trial_steps:
+        if self.automatic:
             return "VRATTLE, automatic"
         if not self.monitors:
             return "RATTLE, fixed steps"
