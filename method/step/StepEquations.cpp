@@ -536,10 +536,7 @@ bool VRattleDynamics::iterateNewton(const Trial& trial) {
  */
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupled() {
     const double h = settings.stepSize;
-    if (!hasHalfStepValue) {
-        halfStepValue = evaluateU(w, theta);
-        hasHalfStepValue = true;
-    }
+    findHalfStepValue();
     if (system.getFirstGeneral() < system.getNumConstraints())
         ensureFactor(GeneralFactor);
     rhoNext = densityScale * StepDensity::sumUpdate(u, rho) + densityOffset;
@@ -632,7 +629,7 @@ double VRattleDynamics::finishCoupledPassOfPieces(const Trial& trial) {
 VRattleDynamics::SolveResult VRattleDynamics::solveCoupledByNewton() {
     ensureFactor(FullFactor);
     const double h = settings.stepSize;
-    const double uMinus = densityScale * evaluateU(w, theta);
+    const double uMinus = densityScale * findHalfStepValue();
     startMultipliers(true);
     rhoNext = densityScale * StepDensity::sumUpdate(u, rho);
     if (!(rhoNext > 0))

@@ -203,6 +203,35 @@ void VRattleDynamics::beginAt(const vector<Vec3>& positions, const vector<Vec3>&
         automatic.begin({q, theta, v, force, lambda});
 }
 
+void VRattleDynamics::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                            double energy, double newDensity, const double* newHalfStepValue, double offset) {
+    begin(positions, velocities, forces, energy);
+    hasDensity = true;
+    rho = newDensity;
+    formHalfStepVelocities();
+    // What a step that has led here would have found.
+    qNext = q;
+    wNext = w;
+    rhoNext = rho;
+    kickNext = 0.5 * settings.stepSize / rho;
+    stepKind = Regular;
+    lambdaNext = lambda;
+    vector<Vec3> copy = forces;
+    finish(copy, energy);
+    v = velocities; // which have been projected, and so changed in the last bits
+    if (newHalfStepValue != nullptr)
+        halfStepValue = *newHalfStepValue;
+    densityOffset = offset;
+}
+
+double VRattleDynamics::findHalfStepValue() {
+    if (needsHalfStepValue() && !hasHalfStepValue) {
+        halfStepValue = evaluateU(w, theta);
+        hasHalfStepValue = true;
+    }
+    return halfStepValue;
+}
+
 void VRattleDynamics::startAutomatic() {
     controlBefore = automatic.getMemory();
     isStartedNow = true;

@@ -135,6 +135,20 @@ public:
      */
     void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                 const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
+    /**
+     * Go on from an on-step state that somebody else's steps have led to, in the middle of a sequence of densities with the same
+     * settings and references. The velocities are taken as they are; the half-step momentum is formed from them.
+     *
+     * @param density          rho[n-1/2]
+     * @param halfStepValue    u(q[n],p[n-1/2]), or null if it is not known
+     * @param offset           what (3.14) and (3.15) differed by in the last step
+     * @throws StepFailure     if the multipliers or monitors are not defined there; then everything is as it was
+     */
+    void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double density, const double* halfStepValue,
+               double offset);
+    /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
+    double findHalfStepValue();
     /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
     void setReferences(const std::vector<double>& references);
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "DeviceSteps.h"
+#include "openmm/common/ContextSelector.h"
 #include <algorithm>
 #include <cmath>
 
@@ -11,7 +12,8 @@ using std::vector;
 
 namespace {
 
-const int NUM_TRIALS = 4;
+// Of a density for (3.14); those that are not needed cost a launch that returns at once.
+const int NUM_TRIALS = 6;
 // Stands for no limit of a step, in single precision too (ps).
 const double NO_LIMIT = 1e30;
 // A step that is none: the state was changed by others.
@@ -19,6 +21,7 @@ const int NO_STEP = -1;
 // What rounding allows: of the constraints and of (3.14).
 const double SINGLE_TOLERANCE = 1e-5, MIXED_TOLERANCE = 1e-12, DOUBLE_TOLERANCE = 1e-13;
 const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
+const double SINGLE_DENSITY_ROUNDING = 1e-4, DENSITY_ROUNDING = 1e-8;
 const double MARGIN = 0.1;
 
 } // namespace
@@ -71,6 +74,7 @@ void DeviceSteps::initialize() {
 }
 
 void DeviceSteps::setSettings(const Settings& newSettings) {
+    OpenMM::ContextSelector selector(context);
     settings = newSettings;
     compile(StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
     vector<double> numbers(Control::FirstTerm + 3 * settings.terms.size());
@@ -81,6 +85,7 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
     numbers[Control::Curve] = settings.density.getCurve();
     numbers[Control::DensityTolerance] =
         std::max(MARGIN * settings.tolerance, isMixed ? DENSITY_TOLERANCE : SINGLE_DENSITY_TOLERANCE);
+    numbers[Control::DensityRounding] = isMixed ? DENSITY_ROUNDING : SINGLE_DENSITY_ROUNDING;
     for (size_t k = 0; k < settings.terms.size(); k++) {
         numbers[Control::FirstTerm + 3 * k] = settings.terms[k].weight;
         numbers[Control::FirstTerm + 3 * k + 1] = settings.terms[k].power;
@@ -223,31 +228,34 @@ void DeviceSteps::launchEvaluate(int step, bool isRescaled) {
 }
 
 bool DeviceSteps::begin(const State& state, double energy) {
+    OpenMM::ContextSelector selector(context);
     vector<double> block(Control::FirstValue + settings.terms.size(), 0.0);
     block[Control::Density] = state.density;
     block[Control::StepSize] = settings.stepSize / state.density;
     block[Control::DensityOffset] = state.densityOffset;
     block[Control::IsHalfKnown] = state.hasHalfStepValue;
     block[Control::HalfU] = state.halfStepValue;
+    block[Control::MismatchSlope] = 1;
     control[half].upload(block, true);
     numStepsRead = numRescuesRead = 0;
     elapsedRead = 0;
     groupEnergy = energy;
     launchFinish(NO_STEP, 0, true, false);
     launchEvaluate(NO_STEP, false);
-    return !hasFailed();
+    return !hasChangeFailed();
 }
 
 bool DeviceSteps::change(double energy) {
+    OpenMM::ContextSelector selector(context);
     launchEvaluate(NO_STEP, false); // u before the change
     groupEnergy = energy;
     launchFinish(NO_STEP, 0, true, true);
     launchEvaluate(NO_STEP, true);
-    return !hasFailed();
+    return !hasChangeFailed();
 }
 
 // Of a change; such a failure leaves nothing to put back.
-bool DeviceSteps::hasFailed() {
+bool DeviceSteps::hasChangeFailed() {
     vector<int> codes;
     failure.download(codes);
     if (codes[0] == 0)
@@ -257,6 +265,7 @@ bool DeviceSteps::hasFailed() {
 }
 
 void DeviceSteps::advance(double maxStep) {
+    OpenMM::ContextSelector selector(context);
     stepNumber++;
     if (kernels.trial)
         for (int i = 0; i < NUM_TRIALS; i++) {
@@ -284,29 +293,39 @@ void DeviceSteps::advance(double maxStep) {
 }
 
 void DeviceSteps::finish(double energy) {
+    OpenMM::ContextSelector selector(context);
     groupEnergy = energy;
     launchFinish(stepNumber, 0.5, false, true);
 }
 
 DeviceSteps::Report DeviceSteps::read() {
+    OpenMM::ContextSelector selector(context);
     launchEvaluate(stepNumber, false);
-    Report report = {};
-    vector<int> codes;
-    failure.download(codes);
-    report.hasFailed = codes[0] != 0;
-    if (report.hasFailed)
-        undo(stepNumber - codes[0] + 1);
-    fill(report);
-    return report;
+    return readAndUndo(0);
 }
 
 DeviceSteps::Report DeviceSteps::putBack() {
+    OpenMM::ContextSelector selector(context);
+    return readAndUndo(1);
+}
+
+// Undo the last steps, or those since one that has failed.
+DeviceSteps::Report DeviceSteps::readAndUndo(int numSteps) {
     Report report = {};
     vector<int> codes;
     failure.download(codes);
     report.hasFailed = codes[0] != 0;
-    undo(report.hasFailed ? stepNumber - codes[0] + 1 : 1);
+    const int code = codes[1] % Control::NumCodes;
+    if (report.hasFailed)
+        numSteps = stepNumber - codes[0] + 1;
+    if (numSteps > 0)
+        undo(numSteps);
+    // The sums are those of the state put back, unless its step got as far as to leave others.
+    bool hasSums = !report.hasFailed || code == Control::NotConverged || code == Control::UnsolvedDensity;
+    if (numSteps > 0 && hasSums)
+        launchEvaluate(NO_STEP, false);
     fill(report);
+    report.state.hasHalfStepValue = report.state.hasHalfStepValue && hasSums;
     return report;
 }
 
@@ -323,6 +342,7 @@ void DeviceSteps::fill(Report& report) {
     control[half].download(block, true);
     report.state = {block[Control::Density], block[Control::DensityOffset], program->hasHalfSums(),
                     block[Control::HalfU]};
+    report.isShortened = block[Control::IsShortened] != 0;
     report.stepSize = block[Control::StepSize];
     report.u = block[Control::U];
     report.values.assign(block.begin() + Control::FirstValue, block.end());
@@ -334,7 +354,24 @@ void DeviceSteps::fill(Report& report) {
     numRescuesRead = block[Control::Rescues];
 }
 
+double DeviceSteps::readElapsed() {
+    OpenMM::ContextSelector selector(context);
+    vector<double> block;
+    control[half].download(block, true);
+    return block[Control::Elapsed] - elapsedRead;
+}
+
+bool DeviceSteps::hasFailed() {
+    OpenMM::ContextSelector selector(context);
+    vector<int> codes;
+    failure.download(codes);
+    return codes[0] != 0;
+}
+
 long long DeviceSteps::getNumIterations() {
+    OpenMM::ContextSelector selector(context);
+    if (!iterationCounts.isInitialized())
+        return 0;
     vector<int> counts;
     iterationCounts.download(counts);
     return *std::max_element(counts.begin(), counts.end());

@@ -44,6 +44,7 @@ public:
         int numSteps, numRescues; // since the last read()
         double u;
         std::vector<double> values; // u(q[n],p[n]) and U_k
+        bool isShortened; // the last step was cut short
         bool hasFailed;
     };
 
@@ -76,6 +77,9 @@ public:
     Report read();
     /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
     Report putBack();
+    /** The time since the last read(), the last advance() included; and whether a step has failed. Both wait for the device. */
+    double readElapsed();
+    bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
     long long getNumIterations();
 
@@ -91,7 +95,8 @@ private:
     void launch(OpenMM::ComputeKernel& kernel);
     void launchFinish(int step, double kick, bool isFormed, bool isStored);
     void launchEvaluate(int step, bool isRescaled);
-    bool hasFailed();
+    bool hasChangeFailed();
+    Report readAndUndo(int numSteps);
     void undo(int numSteps);
     void fill(Report& report);
     OpenMM::ComputeContext& context;

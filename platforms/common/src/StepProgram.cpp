@@ -98,7 +98,7 @@ bool usesMultipliers(StepMonitor::Kind kind) {
                        [](Quantity quantity) { return QUANTITIES.at(quantity).ofConstraint; });
 }
 
-bool usesSpeeds(StepMonitor::Kind kind) {
+bool isOfSpeeds(StepMonitor::Kind kind) {
     const vector<Quantity>& quantities = MONITORS.at(kind).quantities;
     return std::any_of(quantities.begin(), quantities.end(), [](Quantity quantity) {
         return quantity == KineticSquares || quantity == SpeedSquares || quantity == LargestArc;
@@ -114,9 +114,13 @@ StepProgram::Update StepProgram::updateOf(const vector<StepMonitor::Term>& terms
     if (update == StepDensity::Bounded)
         return Bounded;
     const bool dependsOnVelocities = std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) {
-        return usesMultipliers(term.kind) || usesSpeeds(term.kind);
+        return usesMultipliers(term.kind) || isOfSpeeds(term.kind);
     });
     return update == StepDensity::SemiExplicit && dependsOnVelocities ? SemiExplicit : Sum;
+}
+
+bool StepProgram::usesSpeeds(const vector<StepMonitor::Term>& terms) {
+    return std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return isOfSpeeds(term.kind); });
 }
 
 StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMonitor::Term>& terms, Update update,
@@ -146,6 +150,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
                                       {"HALF_U", Control::HalfU},
                                       {"IS_HALF_KNOWN", Control::IsHalfKnown},
                                       {"DENSITY_OFFSET", Control::DensityOffset},
+                                      {"MISMATCH_SLOPE", Control::MismatchSlope},
                                       {"IS_SHORTENED", Control::IsShortened},
                                       {"FIRST_VALUE", Control::FirstValue},
                                       {"CONTROL_SIZE", Control::FirstValue + (int) terms.size()},
@@ -155,10 +160,12 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
                                       {"SLOPE", Control::Slope},
                                       {"CURVE", Control::Curve},
                                       {"DENSITY_TOLERANCE", Control::DensityTolerance},
+                                      {"DENSITY_ROUNDING", Control::DensityRounding},
                                       {"FIRST_TERM", Control::FirstTerm},
                                       {"NOT_CONVERGED", Control::NotConverged},
                                       {"INVALID_MONITOR", Control::InvalidMonitor},
                                       {"DEPENDENT_CONSTRAINTS", Control::DependentConstraints},
+                                      {"UNSOLVED_DENSITY", Control::UnsolvedDensity},
                                       {"NUM_CODES", Control::NumCodes},
                                       {"TRIAL_STATUS", 0},
                                       {"TRIAL_U", 1},
@@ -168,6 +175,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
                                       {"TRIAL_LAST_DENSITY", 5},
                                       {"TRIAL_LAST_MISMATCH", 6},
                                       {"TRIAL_COUNT", 7},
+                                      {"TRIAL_SLOPE", 8},
                                       {"TRIAL_SIZE", Control::TrialSize},
                                       {"TRYING", 0},
                                       {"CONVERGED", 1},
@@ -178,6 +186,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
     defines["WIDE"] = isWide ? "double" : "float";
     // A float has lost the sign of a pivot below this fraction.
     defines["MIN_PIVOT"] = isMixed ? literal(ConstraintMatrix::MIN_RELATIVE_PIVOT) : "1e-5f";
+    defines["SLOPE_ROUNDING"] = isMixed ? "1e-11" : "1e-4f";
     defines["MARGIN"] = "0.1f";
     defines["SLOW_CONVERGENCE"] = "0.25f";
     defines["BOUND_MARGIN"] = literal(StepDensity::DOMAIN_MARGIN);

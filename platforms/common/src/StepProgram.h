@@ -27,6 +27,7 @@ enum Field {
     HalfU,         // u(q[n],p[n-1/2]), where IsHalfKnown says so; else it is in the sums
     IsHalfKnown,
     DensityOffset, // what (3.14) and (3.15) differed by in the last step
+    MismatchSlope, // of (3.14) as a function of the density, in the last step
     IsShortened,   // the last step was cut short
     FirstValue     // U_k
 };
@@ -38,10 +39,11 @@ enum Setting {
     Slope,
     Curve,
     DensityTolerance, // of (3.14), relative
+    DensityRounding,  // the same where rounding allows no better
     FirstTerm
 };
 /** What makes a step fail; the slot of the cluster is above. */
-enum Failure { NotConverged, InvalidMonitor, DependentConstraints, NumCodes };
+enum Failure { NotConverged, InvalidMonitor, DependentConstraints, UnsolvedDensity, NumCodes };
 /** Numbers of the trial of a density. */
 const int TrialSize = 9;
 } // namespace Control
@@ -70,6 +72,8 @@ public:
                 bool isMixed, bool isWide);
     /** The update as a device sees it: what does not depend on velocities needs no iteration. */
     static Update updateOf(const std::vector<StepMonitor::Term>& terms, bool isFixedStep, StepDensity::Update update);
+    /** Whether the monitors depend on the velocities themselves, and not through the multipliers alone. */
+    static bool usesSpeeds(const std::vector<StepMonitor::Term>& terms);
     const std::string& getSource() const {
         return source;
     }

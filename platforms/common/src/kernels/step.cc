@@ -214,7 +214,9 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
 #else
     mixed* halfSums = 0;
 #endif
-    const int end = (failure[0] != 0 ? 0 : numSlots);
+    // After a failure the sums stay those of the state that is put back.
+    const bool isFrozen = (failure[0] != 0);
+    const int end = (isFrozen ? 0 : numSlots);
     for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
         bool isRegular = true;
         FINISH_CASES
@@ -222,13 +224,13 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
             fail(failure, step, DEPENDENT_CONSTRAINTS + NUM_CODES*slot);
     }
     mergeInGroup(sums, buffer);
-    if (LOCAL_ID == 0)
+    if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
             partials[j*NUM_GROUPS + GROUP_ID] = sums[j];
 #if HALF_SUMS
     SYNC_THREADS;
     mergeInGroup(halfSums, buffer);
-    if (LOCAL_ID == 0)
+    if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
             partials[(NUM_SUMS + j)*NUM_GROUPS + GROUP_ID] = halfSums[j];
 #endif
@@ -269,22 +271,30 @@ KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPar
 #if HALF_SUMS
 
 /**
- * What the trial of a density tells: the mismatch of (3.14) at it, and the next density to try by the secant method, whose slope is
- * 1 but for terms of order h. Returns false if there is none.
+ * What the trial of a density tells: the mismatch of (3.14) at it, and the next density to try by the secant method. Returns
+ * false if there is none.
  */
 inline DEVICE bool judgeTrial(wide uTrial, wide* trial, GLOBAL const wide* RESTRICT settings) {
     const wide rho = trial[TRIAL_DENSITY], mismatch = rho + trial[TRIAL_PREVIOUS] - uTrial - trial[TRIAL_HALF_U];
-    const wide change = rho - trial[TRIAL_LAST_DENSITY];
-    wide slope = (trial[TRIAL_COUNT] > 0 && change != 0 ? (mismatch - trial[TRIAL_LAST_MISMATCH])/change : (wide) 1);
-    slope = (slope > (wide) 0.5f && slope < 2 ? slope : (wide) 1);
+    const wide change = rho - trial[TRIAL_LAST_DENSITY], last = trial[TRIAL_LAST_MISMATCH];
+    // The slope by the secant, unless rounding hides it; at first that of the last step.
+    const wide secant = (trial[TRIAL_COUNT] > 0 && fabs(change) > (wide) SLOPE_ROUNDING*rho ? (mismatch - last)/change : (wide) 0);
+    if (secant > (wide) 0.1f && secant < 10)
+        trial[TRIAL_SLOPE] = secant;
+    // What the next density will leave: each secant step gains more than the one before.
+    const wide left = (trial[TRIAL_COUNT] > 1 ? fabs(mismatch*(mismatch/last)) : fabs(mismatch));
+    const wide tolerance = settings[DENSITY_TOLERANCE]*(rho + trial[TRIAL_PREVIOUS]);
     trial[TRIAL_LAST_DENSITY] = rho;
     trial[TRIAL_LAST_MISMATCH] = mismatch;
     trial[TRIAL_COUNT] += 1;
     if (!(uTrial >= 0))
         return false;
-    if (fabs(mismatch) <= settings[DENSITY_TOLERANCE]*(rho + trial[TRIAL_PREVIOUS]))
+    // Or as far as rounding allows.
+    const bool isRounding = (trial[TRIAL_COUNT] > 1 && !(fabs(mismatch) < fabs(last)/2) &&
+            fabs(mismatch) <= settings[DENSITY_ROUNDING]*(rho + trial[TRIAL_PREVIOUS]));
+    if (fabs(mismatch) <= tolerance || left <= tolerance || isRounding)
         trial[TRIAL_STATUS] = CONVERGED;
-    trial[TRIAL_DENSITY] = rho - mismatch/slope;
+    trial[TRIAL_DENSITY] = rho - mismatch/trial[TRIAL_SLOPE];
     return trial[TRIAL_DENSITY] > 0;
 }
 
@@ -312,6 +322,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
             trial[TRIAL_PREVIOUS] = control[DENSITY];
             trial[TRIAL_HALF_U] = (control[IS_HALF_KNOWN] != 0 ? control[HALF_U] : evaluateMonitors(halfSums, groupEnergy, settings, values));
             trial[TRIAL_DENSITY] = 2*u - control[DENSITY] + control[DENSITY_OFFSET];
+            trial[TRIAL_SLOPE] = control[MISMATCH_SLOPE];
             trial[TRIAL_STATUS] = (u >= 0 && trial[TRIAL_HALF_U] >= 0 && trial[TRIAL_DENSITY] > 0 ? TRYING : UNSOLVED);
         }
         else if (trial[TRIAL_STATUS] == TRYING && !judgeTrial(sums[FAILURES] > 0 ? (wide) -1 : evaluateMonitors(sums, groupEnergy, settings, values), trial, settings))
@@ -367,9 +378,12 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         const wide u = trial[TRIAL_U];
         if (trial[TRIAL_STATUS] == TRYING)
             judgeTrial(sums[FAILURES] > 0 ? (wide) -1 : evaluateMonitors(sums, groupEnergy, settings, values), trial, settings);
-        wide rho = (trial[TRIAL_STATUS] == CONVERGED ? trial[TRIAL_DENSITY] : (wide) -1);
+        const bool isSolved = (trial[TRIAL_STATUS] == CONVERGED);
+        wide rho = (isSolved ? trial[TRIAL_DENSITY] : (wide) 1);
+        now[MISMATCH_SLOPE] = trial[TRIAL_SLOPE];
 #else
         const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+        const bool isSolved = true;
         wide rho = nextDensity(u, now, settings);
 #endif
 #if UPDATE != FIXED && UPDATE != BOUNDED
@@ -380,14 +394,16 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         }
 #endif
         enterStep(rho, u, maxStep, now, settings);
-        const bool isValid = (u >= 0 && now[STEP_SIZE] < (wide) 1e30f);
-        shared[0] = (isValid && !isFrozen ? now[STEP_SIZE] : (wide) -1);
+        const bool isMonitorValid = (u >= 0), isStep = (isSolved && now[STEP_SIZE] < (wide) 1e30f);
+        shared[0] = (isMonitorValid && isStep && !isFrozen ? now[STEP_SIZE] : (wide) -1);
         if (GROUP_ID == 0 && !isFrozen) {
-            if (isValid)
+            if (!isMonitorValid) // the state at the end of the step before is no good
+                fail(failure, step - 1, INVALID_MONITOR);
+            else if (!isStep)
+                fail(failure, step, UNSOLVED_DENSITY);
+            else
                 for (int i = 0; i < CONTROL_SIZE; i++)
                     nextControl[i] = now[i];
-            else // the state at the end of the step before is no good
-                fail(failure, step - 1, INVALID_MONITOR);
         }
     }
     SYNC_THREADS;

@@ -1,0 +1,403 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "CommonRunDevice.h"
+#include "ComputeVectors.h"
+#include "constraints/StepFailure.h"
+#include "openmm/common/ContextSelector.h"
+#include "run/IntegratorSettings.h"
+#include <algorithm>
+#include <cmath>
+#include <iostream>
+#include <limits>
+
+using namespace OpenMMVRattle;
+using OpenMM::ContextSelector;
+using std::vector;
+
+namespace {
+
+const double NO_LIMIT = std::numeric_limits<double>::infinity();
+// OpenMM sorts the particles anew after so many steps, once somebody asks for it.
+const int STEPS_BETWEEN_REORDERINGS = 250;
+// The steps that are taken without a look at the device, while none fails.
+const int MAX_STEPS_UNTIL_LOOK = 1 << 20;
+
+// Takes note that forces and particles are no longer in the same order. Nothing else of ours depends on it: only identical molecules
+// change places, and they have identical clusters.
+class ReorderingNote : public OpenMM::ComputeContext::ReorderListener {
+public:
+    explicit ReorderingNote(bool& note) : note(note) {
+    }
+    void execute() override {
+        note = true;
+    }
+
+private:
+    bool& note;
+};
+
+} // namespace
+
+CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
+                                 const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
+        HostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
+        steps(compute, context.getSystem()), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
+        areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
+        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), forceCount(-1),
+        writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
+    compute.initializeContexts();
+    ContextSelector selector(compute);
+    compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context
+}
+
+// ------------------------------------------------------------------------------------------------ from one to the other
+
+int CommonRunDevice::getNumWrites() const {
+    return static_cast<const ComputeVectors&>(*vectors).getNumWrites();
+}
+
+double CommonRunDevice::computeForces() {
+    groupEnergy = HostRunDevice::computeForces();
+    forceCount = compute.getComputeForceCount();
+    writeCount = getNumWrites();
+    areAtomsReordered = false;
+    return groupEnergy;
+}
+
+// Compute the forces unless those of the present state are there.
+void CommonRunDevice::ensureForces() {
+    if (forceCount != compute.getComputeForceCount() || writeCount != getNumWrites() || areAtomsReordered)
+        computeForces();
+}
+
+// Whether the next step is one in the middle of a run, all of whose numbers are known.
+bool CommonRunDevice::canStepOnDevice() {
+    if (settings.isAutomatic || ahead != nullptr || !dynamics->hasStarted())
+        return false;
+    const vector<double> references = dynamics->getReferences();
+    return std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
+}
+
+// The state goes to the device, where positions, velocities and forces are.
+void CommonRunDevice::beginOnDevice() {
+    ensureForces();
+    if (!areSettingsOnDevice) {
+        vector<StepMonitor::Term> terms = settings.terms;
+        const vector<double> references = dynamics->getReferences();
+        for (size_t k = 0; k < terms.size(); k++)
+            terms[k].reference = references[k];
+        steps.setSettings({settings.stepSize,
+                           StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
+                           settings.update, settings.isFixedStep, settings.tolerance, terms});
+        areSettingsOnDevice = true;
+    }
+    hasBegun = steps.begin(state, groupEnergy);
+    hasReport = false;
+}
+
+// The host gets the device's state as well.
+void CommonRunDevice::bringToHost() {
+    settle();
+    if (isOnHost)
+        return;
+    ensureForces();
+    dynamics->adopt(vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy, state.density,
+                    state.hasHalfStepValue ? &state.halfStepValue : nullptr, state.densityOffset);
+    isOnHost = true;
+}
+
+// And goes on with it.
+void CommonRunDevice::takeToHost() {
+    bringToHost();
+    isOnDevice = false;
+}
+
+// ----------------------------------------------------------------------------------------------------------- the steps
+
+void CommonRunDevice::step(double maxTime) {
+    if (maxTime < NO_LIMIT)
+        settle();
+    if (!isOnDevice && canStepOnDevice()) {
+        const double halfStepValue = dynamics->findHalfStepValue();
+        const VRattleDynamics::Memory memory = dynamics->getMemory();
+        state = {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
+        isOnDevice = true;
+        hasBegun = false;
+    }
+    if (isOnDevice && !hasBegun) {
+        beginOnDevice();
+        isOnDevice = hasBegun || !isOnHost;
+        if (!hasBegun)
+            takeToHost(); // which says what is wrong
+    }
+    if (isOnDevice)
+        stepOnDevice(maxTime);
+    else
+        HostRunDevice::step(maxTime);
+    knownCount = vectors->getStepCount();
+}
+
+void CommonRunDevice::stepOnDevice(double maxTime) {
+    if (numAsked == 0) {
+        settledTime = vectors->getTime();
+        settledCount = vectors->getStepCount();
+    }
+    ensureForces();
+    isOnHost = hasReport = false;
+    lastMaxTime = maxTime;
+    steps.advance(maxTime - vectors->getTime());
+    numAsked++;
+    try {
+        context.computeVirtualSites();
+        if (reach.isUnknown)
+            vectors->setTime(settledTime + steps.readElapsed());
+        vectors->setStepCount(settledCount + numAsked);
+        // A state that is to be put back must not have been put into another order.
+        if (compute.getStepsSinceReorder() < STEPS_BETWEEN_REORDERINGS || !steps.hasFailed()) {
+            ContextSelector selector(compute);
+            compute.reorderAtoms();
+        }
+        computeForces();
+    }
+    catch (...) {
+        accept(steps.putBack());
+        context.computeVirtualSites();
+        throw;
+    }
+    steps.finish(groupEnergy);
+    if (numAsked >= stepsUntilLook)
+        settle();
+}
+
+// Take note of what has become of the steps that were asked for.
+void CommonRunDevice::accept(const DeviceSteps::Report& report) {
+    const bool areAllComplete = report.numSteps == numAsked;
+    state = report.state;
+    if (report.numSteps > 0)
+        lastStep = {report.stepSize, report.state.density};
+    numDeviceRescues += report.numRescues;
+    vectors->setTime(report.isShortened && areAllComplete ? lastMaxTime : settledTime + report.elapsed);
+    vectors->setStepCount(settledCount + report.numSteps);
+    knownCount = settledCount + report.numSteps;
+    numAsked = 0;
+    lastReport = report;
+    hasReport = areAllComplete;
+    hasBegun = areAllComplete;
+    if (!areAllComplete)
+        forceCount = -1;
+}
+
+void CommonRunDevice::settle() {
+    while (numAsked > 0) {
+        const int asked = numAsked;
+        const DeviceSteps::Report report = steps.read();
+        accept(report);
+        // What follows a step that has failed is done in vain, so where steps fail often the device is looked at often.
+        stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MAX_STEPS_UNTIL_LOOK);
+        if (!report.hasFailed)
+            return;
+        // The step that failed is left to the host, which has other means, and says what is wrong if they fail too.
+        context.computeVirtualSites();
+        takeToHost();
+        HostRunDevice::step(lastMaxTime);
+        for (int i = report.numSteps + 1; i < asked; i++)
+            step(NO_LIMIT);
+    }
+}
+
+// ------------------------------------------------------------------------------------------------------ what has changed
+
+void CommonRunDevice::setSettings(const IntegratorSettings& from) {
+    if (isOnDevice)
+        takeToHost();
+    IntegratorSettings possible = from;
+    possible.constraintTolerance = DeviceSteps::tolerableTolerance(compute, from.constraintTolerance);
+    static bool hasWarned = false;
+    if (possible.constraintTolerance > from.constraintTolerance && !hasWarned) {
+        hasWarned = true;
+        std::cerr << "VariableStepRattleIntegrator: the constraint tolerance " << from.constraintTolerance
+                  << " is below what the precision of this Context allows; " << possible.constraintTolerance
+                  << " is used" << std::endl;
+    }
+    HostRunDevice::setSettings(possible);
+    areSettingsOnDevice = false;
+}
+
+void CommonRunDevice::setReferences(const vector<double>& references) {
+    if (isOnDevice)
+        takeToHost();
+    HostRunDevice::setReferences(references);
+    areSettingsOnDevice = false;
+}
+
+bool CommonRunDevice::updateState() {
+    // What changes positions must not find those of a step that has failed.
+    if (reach.hasBarostat || reach.isUnknown)
+        settle();
+    try {
+        return HostRunDevice::updateState();
+    }
+    catch (...) {
+        settle();
+        throw;
+    }
+}
+
+RunDevice::Change CommonRunDevice::findChange() {
+    if (ahead != nullptr || dynamics->getPositions().empty())
+        return HostRunDevice::findChange();
+    const OpenMM::Vec3* box = vectors->getBoxVectors();
+    const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
+    std::copy(box, box + 3, boxVectors);
+    if (isOtherBox)
+        return Change::Box;
+    // Another integrator (of a CompoundIntegrator) has taken steps.
+    if (vectors->getStepCount() != knownCount)
+        return Change::State;
+    // A uniform motion is of no concern to constraints and their forces.
+    const bool doesFrameMatter = reach.movesFrame && StepProgram::usesSpeeds(settings.terms);
+    return reach.isUnknown || reach.hasThermostat || doesFrameMatter ? Change::Velocities : Change::None;
+}
+
+unsigned long long CommonRunDevice::getFingerprint() {
+    settle();
+    return HostRunDevice::getFingerprint();
+}
+
+void CommonRunDevice::start() {
+    settle();
+    isOnDevice = false;
+    isOnHost = true;
+    forceCount = -1;
+    HostRunDevice::start();
+    knownCount = vectors->getStepCount();
+}
+
+void CommonRunDevice::changeState() {
+    settle();
+    if (!isOnDevice || !hasBegun) {
+        takeToHost();
+        forceCount = -1;
+        HostRunDevice::changeState();
+        return;
+    }
+    computeForces();
+    hasBegun = steps.change(groupEnergy);
+    knownCount = vectors->getStepCount();
+    readState();
+}
+
+void CommonRunDevice::changeForces() {
+    settle();
+    if (!isOnDevice || !hasBegun) {
+        takeToHost();
+        forceCount = -1;
+        HostRunDevice::changeForces();
+        return;
+    }
+    computeForces();
+    hasBegun = steps.change(groupEnergy);
+    knownCount = vectors->getStepCount();
+    readState();
+}
+
+void CommonRunDevice::changeVelocities() {
+    settle();
+    if (!isOnDevice || !hasBegun) {
+        takeToHost();
+        HostRunDevice::changeVelocities();
+        return;
+    }
+    ensureForces();
+    hasBegun = steps.change(groupEnergy);
+    readState();
+}
+
+// After a change; where it has failed, the host will say why.
+void CommonRunDevice::readState() {
+    isOnHost = false;
+    hasReport = hasBegun;
+    if (!hasBegun)
+        return;
+    lastReport = steps.read();
+    state = lastReport.state;
+}
+
+void CommonRunDevice::writeVelocities() {
+    settle();
+    if (!isOnDevice)
+        HostRunDevice::writeVelocities();
+}
+
+void CommonRunDevice::reverse() {
+    takeToHost();
+    HostRunDevice::reverse();
+}
+
+void CommonRunDevice::beginTrial(double stepSize, bool isBackwards) {
+    takeToHost();
+    HostRunDevice::beginTrial(stepSize, isBackwards);
+}
+
+// ------------------------------------------------------------------------------------------------------------- numbers
+
+RunDevice::LastStep CommonRunDevice::getLastStep() {
+    settle();
+    return lastStep;
+}
+
+double CommonRunDevice::getTime() {
+    settle();
+    return HostRunDevice::getTime();
+}
+
+vector<double> CommonRunDevice::getMonitorValues() {
+    settle();
+    if (isOnDevice && hasBegun) {
+        if (!hasReport) {
+            lastReport = steps.read();
+            hasReport = true;
+        }
+        return lastReport.values;
+    }
+    bringToHost();
+    return HostRunDevice::getMonitorValues();
+}
+
+vector<double> CommonRunDevice::getMultipliers() {
+    bringToHost();
+    return HostRunDevice::getMultipliers();
+}
+
+double CommonRunDevice::computeKineticEnergy() {
+    settle();
+    ContextSelector selector(compute);
+    return compute.getIntegrationUtilities().computeKineticEnergy(0);
+}
+
+long long CommonRunDevice::getNumSolverIterations() {
+    settle();
+    return HostRunDevice::getNumSolverIterations() + steps.getNumIterations();
+}
+
+long long CommonRunDevice::getNumRescues() {
+    settle();
+    return HostRunDevice::getNumRescues() + numDeviceRescues;
+}
+
+void CommonRunDevice::save(RunState& run) {
+    bringToHost();
+    HostRunDevice::save(run);
+}
+
+bool CommonRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
+    settle();
+    forceCount = -1;
+    if (!HostRunDevice::resume(run, saved, areForcesOthers))
+        return false;
+    isOnDevice = false;
+    isOnHost = true;
+    knownCount = vectors->getStepCount();
+    return true;
+}

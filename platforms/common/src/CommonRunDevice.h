@@ -1,0 +1,81 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_COMMONRUNDEVICE_H_
+#define OPENMMVRATTLE_COMMONRUNDEVICE_H_
+
+#include "DeviceSteps.h"
+#include "HostRunDevice.h"
+#include <memory>
+
+namespace OpenMMVRattle {
+
+/**
+ * The device for OpenCL, CUDA and HIP. The steps in the middle of a run are taken by the GPU (DeviceSteps), which nobody waits for
+ * until the run settles. What is rare is done on the host with forces from the GPU: the start, the first step, a step that the GPU
+ * could not complete, trial runs, turning around, saving. The two hand the state over to each other.
+ */
+class CommonRunDevice : public HostRunDevice {
+public:
+    CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
+                    const IntegratorSettings& settings);
+    void setSettings(const IntegratorSettings& settings) override;
+    void setReferences(const std::vector<double>& references) override;
+    bool updateState() override;
+    Change findChange() override;
+    unsigned long long getFingerprint() override;
+    void start() override;
+    void changeState() override;
+    void changeVelocities() override;
+    void changeForces() override;
+    void writeVelocities() override;
+    void step(double maxTime) override;
+    void settle() override;
+    void reverse() override;
+    LastStep getLastStep() override;
+    double getTime() override;
+    void beginTrial(double stepSize, bool isBackwards) override;
+    std::vector<double> getMonitorValues() override;
+    std::vector<double> getMultipliers() override;
+    double computeKineticEnergy() override;
+    long long getNumSolverIterations() override;
+    long long getNumRescues() override;
+    void save(RunState& run) override;
+    bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
+
+protected:
+    double computeForces() override;
+
+private:
+    bool canStepOnDevice();
+    void ensureForces();
+    int getNumWrites() const;
+    void readState();
+    void beginOnDevice();
+    void stepOnDevice(double maxTime);
+    void accept(const DeviceSteps::Report& report);
+    void bringToHost();
+    void takeToHost();
+    OpenMM::ComputeContext& compute;
+    DeviceSteps steps;
+    DeviceSteps::State state; // of the device when it was read last
+    DeviceSteps::Report lastReport;
+    bool isOnDevice;    // the state is that of the device, and goes on there
+    bool hasBegun;      // the device has what it needs for the next step
+    bool isOnHost;      // the host's state is the same
+    bool areSettingsOnDevice, hasReport;
+    int numAsked;       // steps since the last settle()
+    int stepsUntilLook; // how many there may be
+    double lastMaxTime; // of the last of them
+    double settledTime;
+    long long settledCount, knownCount;
+    double groupEnergy; // of the last forces
+    int forceCount;     // of the Context's evaluations, when they were computed; -1 if they are others
+    int writeCount;     // of positions, likewise
+    bool areAtomsReordered; // since then
+    long long numDeviceRescues;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_COMMONRUNDEVICE_H_

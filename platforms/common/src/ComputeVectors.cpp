@@ -1,0 +1,59 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "ComputeVectors.h"
+#include "openmm/kernels.h"
+
+using namespace OpenMMVRattle;
+using OpenMM::UpdateStateDataKernel;
+
+ComputeVectors::ComputeVectors(OpenMM::ContextImpl& context) :
+        context(context), kernel(context.getPlatform().createKernel(UpdateStateDataKernel::Name(), context)),
+        numWrites(0) {
+    kernel.getAs<UpdateStateDataKernel>().initialize(context.getSystem());
+}
+
+const ContextVectors::Vectors& ComputeVectors::getPositions() {
+    kernel.getAs<UpdateStateDataKernel>().getPositions(context, positions);
+    return positions;
+}
+
+const ContextVectors::Vectors& ComputeVectors::getVelocities() {
+    kernel.getAs<UpdateStateDataKernel>().getVelocities(context, velocities);
+    return velocities;
+}
+
+ContextVectors::Vectors& ComputeVectors::getForces() {
+    context.getForces(forces);
+    return forces;
+}
+
+void ComputeVectors::setPositions(const Vectors& newPositions) {
+    kernel.getAs<UpdateStateDataKernel>().setPositions(context, newPositions);
+    numWrites++;
+}
+
+void ComputeVectors::setVelocities(const Vectors& newVelocities) {
+    kernel.getAs<UpdateStateDataKernel>().setVelocities(context, newVelocities);
+}
+
+const OpenMM::Vec3* ComputeVectors::getBoxVectors() {
+    context.getPeriodicBoxVectors(box[0], box[1], box[2]);
+    return box;
+}
+
+double ComputeVectors::getTime() {
+    return kernel.getAs<UpdateStateDataKernel>().getTime(context);
+}
+
+void ComputeVectors::setTime(double time) {
+    kernel.getAs<UpdateStateDataKernel>().setTime(context, time);
+}
+
+long long ComputeVectors::getStepCount() {
+    return kernel.getAs<UpdateStateDataKernel>().getStepCount(context);
+}
+
+void ComputeVectors::setStepCount(long long count) {
+    kernel.getAs<UpdateStateDataKernel>().setStepCount(context, count);
+}
