@@ -16,11 +16,12 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import openmm
 import pytest
-from openmmvrattle.compare.comparison import Case, compare, verdict
+from openmmvrattle.compare.comparison import Case, compare, run_case, verdict
 from openmmvrattle.compare.measurement import (
     ACCURACY_TOLERANCE,
     INTEGRATORS,
@@ -199,10 +200,13 @@ class _EndsTheProcess:
         return exec, ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)",)
 
 
+def deadly(case):
+    return replace(case, test_system=replace(case.test_system, topology=_EndsTheProcess()))
+
+
 def test_a_process_that_dies_is_a_failed_run():
     good, bad = small_case("good", integrators=("RATTLE",)), small_case("bad", integrators=("RATTLE",))
-    bad = replace(bad, test_system=replace(bad.test_system, topology=_EndsTheProcess()))
-    results, _ = run_sweep([bad, good], ProcessRunner(2))
+    results, _ = run_sweep([deadly(bad), good], ProcessRunner(2))
     assert results[0].runs[0].failure == "its process ended by signal SIGKILL"
     assert results[1].runs[0].failure is None
 
@@ -231,7 +235,7 @@ def test_progress_is_told_from_other_processes():
 def cluster():
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as local_cluster:
         yield local_cluster
 
@@ -246,13 +250,44 @@ def test_a_cluster_gives_the_same_results(cluster):
     assert numbers_of(distributed_ones) == numbers_of(serial)
 
 
-def test_a_worker_that_dies_is_a_failed_run(cluster):
-    """Dask tries again on other workers, and gives up."""
-    good, bad = small_case("good", integrators=("RATTLE",)), small_case("bad", integrators=("RATTLE",))
-    bad = replace(bad, test_system=replace(bad.test_system, topology=_EndsTheProcess()))
-    results, _ = run_sweep([bad, good], DaskRunner(cluster.scheduler_address))
-    assert "died" in results[0].runs[0].failure
-    assert results[1].runs[0].failure is None
+@pytest.mark.parametrize(("threads", "deadly_one"), [(1, 0), (2, 1)])
+def test_a_worker_that_dies_is_a_failed_run(threads, deadly_one):
+    """Dask tries again and gives up, and only on the run that is to blame: the others are lost with it at first.
+
+    On a single worker all of them are: they run or wait there, or their results do.
+    """
+    distributed = pytest.importorskip("distributed")
+    cases = [small_case(label, integrators=("RATTLE",)) for label in ("one", "two")]
+    cases[deadly_one] = deadly(cases[deadly_one])
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=threads, dashboard_address=":0") as local_cluster:
+        results, _ = run_sweep(cases, DaskRunner(local_cluster.scheduler_address))
+    for index, result in enumerate(results):
+        if index == deadly_one:
+            assert "died" in result.runs[0].failure
+        else:
+            assert result.runs[0].failure is None
+
+
+@pytest.mark.parametrize(("times", "failure"), [(1, None), (100, "scheduler-connection-lost")])
+def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure):
+    """As all are when the scheduler is started anew; but not for ever."""
+    from distributed import CancelledError
+
+    runner = DaskRunner.__new__(DaskRunner)
+    runner._client = SimpleNamespace(close=lambda: None)
+    cases = [small_case("one", integrators=("RATTLE",)), small_case("two", integrators=("RATTLE",))]
+    begun = []
+
+    def outcomes(self, sent, works):
+        begun.append(list(works))
+        for work in works:
+            cancelled = work == (1, 0) and len(begun) <= times
+            yield work, CancelledError("scheduler-connection-lost") if cancelled else run_case(cases[work[0]], work[1])
+
+    monkeypatch.setattr(DaskRunner, "_outcomes", outcomes)
+    results, _ = run_sweep(cases, runner)
+    assert [result.runs[0].failure for result in results] == [None, failure]
+    assert begun == [[(0, 0), (1, 0)]] + [[(1, 0)]] * (1 if failure is None else 3)
 
 
 def test_the_command_line_on_a_cluster(cluster, tmp_path):

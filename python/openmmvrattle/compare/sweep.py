@@ -13,8 +13,10 @@ import multiprocessing
 import os
 import pickle
 import signal
+import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
@@ -26,6 +28,8 @@ __all__ = ["DaskRunner", "ProcessRunner", "Runner", "RunnerError", "SerialRunner
 
 Work = tuple[int, int]
 """The index of a case and that of one of its methods."""
+_TRIES_ALONE = 3
+"""How often a run is begun that a Dask cluster cancels though nothing else is run beside it."""
 SweepProgress = Callable[[Work, str, float], None]
 """Called with a piece of work, what is being done, and the fraction that is done."""
 
@@ -233,23 +237,54 @@ class DaskRunner:
         self, cases: Sequence[Case], works: Sequence[Work], progress: SweepProgress
     ) -> Generator[tuple[Work, IntegratorRun], None, None]:
         """See `Runner`."""
-        from distributed import as_completed
+        from distributed import CancelledError, KilledWorker
 
         # As bytes, which only the process that runs them unpacks: what cannot be unpacked there is a failed run.
         sent = {index: pickle.dumps(cases[index]) for index in {case for case, _ in works}}
+
+        def failed(work: Work, error: BaseException) -> IntegratorRun:
+            return failed_run(cases[work[0]].methods()[work[1]], " ".join(str(error).split()))
+
+        try:
+            # A run that kills its worker takes others with it: those whose results were there, and those that had begun
+            # or waited there, which Dask in the end blames as well. So what was lost is run once more with nothing
+            # beside it, and what is lost then has itself to blame.
+            lost: list[Work] = []
+            with closing(self._outcomes(sent, works)) as outcomes:
+                for work, outcome in outcomes:
+                    if isinstance(outcome, (KilledWorker, CancelledError)):
+                        lost.append(work)
+                        progress(work, "lost with its worker, waiting", 0.0)
+                    else:
+                        yield work, failed(work, outcome) if isinstance(outcome, BaseException) else outcome
+            for work in lost:
+                for _ in range(_TRIES_ALONE):
+                    progress(work, "starting alone", 0.0)
+                    [(_, outcome)] = self._outcomes(sent, [work])
+                    if not isinstance(outcome, CancelledError):
+                        break
+                yield work, failed(work, outcome) if isinstance(outcome, BaseException) else outcome
+        finally:
+            self._client.close()
+
+    def _outcomes(
+        self, sent: dict[int, bytes], works: Sequence[Work]
+    ) -> Generator[tuple[Work, IntegratorRun | BaseException], None, None]:
+        """Carry out works side by side; what ends one of them with an error is yielded in place of its result."""
+        from distributed import as_completed
+
         futures = {}
         for index, method in works:
-            key = f"vrattle-{os.getpid()}-{index}-{method}"
+            key = f"vrattle-{index}-{method}-{uuid.uuid4()}"
             futures[self._client.submit(_run_pickled, sent[index], method, pure=False, key=key)] = (index, method)
         try:
             for future in as_completed(futures, loop=self._client.loop):
-                index, method = work = futures[future]
-                if future.status == "finished":
-                    yield work, future.result()
-                else:
-                    error = future.exception() if future.status == "error" else "it was cancelled"
-                    yield work, failed_run(cases[index].methods()[method], " ".join(str(error).split()))
+                # A result that went with its worker is computed again meanwhile, and may end otherwise.
+                try:
+                    outcome = future.result()
+                except Exception as error:
+                    outcome = error
+                yield futures[future], outcome
                 future.release()
         finally:
             self._client.cancel([future for future in futures if not future.done()])
-            self._client.close()
