@@ -961,6 +961,19 @@ def test_the_benchmark_runs(benchmark: ModuleType, tmp_path: Path, capsys: pytes
         assert (tmp_path / name).read_bytes()[1:4] == b"PNG"
 
 
+def test_the_benchmark_of_unseen_systems_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unseen = load_script("benchmarks/automatic_unseen.py")
+    names = ["heating by hand", "comet", "two N2, 1 nm", "cold spring"]
+    assert unseen.main(["--quick", "--systems", *names, "--output", str(tmp_path)]) == 0
+    lines = (tmp_path / "automatic_unseen.jsonl").read_text(encoding="utf-8").splitlines()
+    results = [json.loads(line) for line in lines]
+    assert [r["system"] for r in results] == names
+    for result in results:
+        assert 0.9 < result["automatic"]["steps"] / result["fixed"]["steps"] < 3
+        assert result["automatic"]["time"] == pytest.approx(result["fixed"]["time"], rel=0.05)
+    assert "| comet |" in capsys.readouterr().out
+
+
 def test_the_benchmark_finds_a_loss(benchmark: ModuleType) -> None:
     good, bad = (benchmark.Run(1000, error, 0.001, 1.0) for error in (1.0, 1.2))
     whip, water = benchmark.PROBLEMS["whip"], benchmark.PROBLEMS["8 waters"]
