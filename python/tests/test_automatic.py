@@ -474,7 +474,9 @@ def test_a_parameter_renews_the_forces() -> None:
     integrator.step(20)
     context.setParameter("k", 100.0)
     position, velocity = positions_of(context), velocities_of(context)
+    evaluations = integrator.getNumForceEvaluations()
     integrator.step(20)
+    assert integrator.getNumForceEvaluations() == evaluations + 21
     fresh = automatic(0.001)
     for k in range(2):
         fresh.setReferenceMonitorValue(integrator.getReferenceMonitorValue(k), k)
@@ -483,7 +485,8 @@ def test_a_parameter_renews_the_forces() -> None:
     other.setPositions(position)
     other.setVelocities(velocity)
     fresh.step(20)
-    np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=1e-10)
+    # The one goes on with its density and the other starts one, both close to 1 in the dead zone.
+    np.testing.assert_allclose(positions_of(context), positions_of(other), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("make, step", [(waters, 0.001), (whip, 0.003)])
