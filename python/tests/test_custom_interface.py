@@ -35,6 +35,8 @@ from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide, argon_cluster, rigid_waters
 from run_support import solvated
 
+pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
+
 SETTINGS: list[dict[str, Any]] = [
     {},
     {"updateMethod": 2},
