@@ -107,7 +107,7 @@ wheel: $(PACKAGE_TOOLS)
 	rm -rf dist/*.whl $(BUILD)/wheel
 	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m build --wheel --outdir $(BUILD)/wheel .
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --exclude libOpenMM.so --exclude libOpenMMOpenCL.so \
-		--exclude libOpenMMCUDA.so --wheel-dir dist $(BUILD)/wheel/*.whl
+		--exclude libOpenMMCUDA.so --exclude libOpenMMHIP.so --wheel-dir dist $(BUILD)/wheel/*.whl
 	$(call test_package,$(CURDIR)/dist/*.whl,$(CURDIR))
 
 # The sources in dist, from which a build is made and tested with the tests that are in the archive.

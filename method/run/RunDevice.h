@@ -153,6 +153,10 @@ public:
     virtual std::vector<double> getMultipliers() = 0;
     /** The kinetic energy of the Context's velocities (kJ/mol). */
     virtual double computeKineticEnergy() = 0;
+    /** Whether the next step goes on with the forces that somebody else has computed, who is to compute them with each energy. */
+    virtual bool usesForcesOfOthers() {
+        return false;
+    }
     /** How often forces have been computed, iterations of the solver taken, and steps rescued, since the device exists. */
     virtual long long getNumForceEvaluations() = 0;
     virtual long long getNumSolverIterations() = 0;

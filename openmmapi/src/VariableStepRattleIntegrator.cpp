@@ -507,8 +507,9 @@ double VariableStepRattleIntegrator::computeKineticEnergy() {
     return requireRun().getDevice().computeKineticEnergy();
 }
 
+// Nothing of ours does; but on GPUs energies without forces would leave none for the next step.
 bool VariableStepRattleIntegrator::kineticEnergyRequiresForce() const {
-    return false;
+    return run != nullptr && run->getDevice().usesForcesOfOthers();
 }
 
 // ---------------------------------------------------------------------------------------------- saving and restoring

@@ -41,7 +41,12 @@ __all__ = [
 _COMPILED = ("VariableStepRattleIntegrator", "advise")
 
 # The platforms that each of our libraries serves. The CPU platform runs the kernels of Reference.
-_PLATFORMS_OF_LIBRARY: dict[str, tuple[str, ...]] = {"OpenMMVRattleReference": ("Reference", "CPU")}
+_PLATFORMS_OF_LIBRARY: dict[str, tuple[str, ...]] = {
+    "OpenMMVRattleReference": ("Reference", "CPU"),
+    "OpenMMVRattleOpenCL": ("OpenCL",),
+    "OpenMMVRattleCUDA": ("CUDA",),
+    "OpenMMVRattleHIP": ("HIP",),
+}
 
 
 def _check_openmm_version(built: str, running: str) -> None:

@@ -44,7 +44,7 @@ CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeCo
         HostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
         steps(compute, context.getSystem()), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
         areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
-        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), forceCount(-1),
+        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
         writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
     compute.initializeContexts();
     ContextSelector selector(compute);
@@ -59,15 +59,23 @@ int CommonRunDevice::getNumWrites() const {
 
 double CommonRunDevice::computeForces() {
     groupEnergy = HostRunDevice::computeForces();
-    forceCount = compute.getComputeForceCount();
+    hasForces = true;
     writeCount = getNumWrites();
+    if (areAtomsReordered)
+        order = compute.getAtomIndex();
     areAtomsReordered = false;
     return groupEnergy;
 }
 
-// Compute the forces unless those of the present state are there.
+// Whether the forces are those of the present state. Others may have computed them again, with an energy. A barostat that rejects a
+// move puts forces and the order of the atoms back.
+bool CommonRunDevice::areForcesValid() {
+    return hasForces && writeCount == getNumWrites() && context.getLastForceGroups() == forceGroups &&
+           (!areAtomsReordered || compute.getAtomIndex() == order);
+}
+
 void CommonRunDevice::ensureForces() {
-    if (forceCount != compute.getComputeForceCount() || writeCount != getNumWrites() || areAtomsReordered)
+    if (!areForcesValid())
         computeForces();
 }
 
@@ -185,7 +193,7 @@ void CommonRunDevice::accept(const DeviceSteps::Report& report) {
     hasReport = areAllComplete;
     hasBegun = areAllComplete;
     if (!areAllComplete)
-        forceCount = -1;
+        hasForces = false;
 }
 
 void CommonRunDevice::settle() {
@@ -269,7 +277,7 @@ void CommonRunDevice::start() {
     settle();
     isOnDevice = false;
     isOnHost = true;
-    forceCount = -1;
+    hasForces = false;
     HostRunDevice::start();
     knownCount = vectors->getStepCount();
 }
@@ -278,7 +286,7 @@ void CommonRunDevice::changeState() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
-        forceCount = -1;
+        hasForces = false;
         HostRunDevice::changeState();
         return;
     }
@@ -292,7 +300,7 @@ void CommonRunDevice::changeForces() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
-        forceCount = -1;
+        hasForces = false;
         HostRunDevice::changeForces();
         return;
     }
@@ -393,7 +401,7 @@ void CommonRunDevice::save(RunState& run) {
 
 bool CommonRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     settle();
-    forceCount = -1;
+    hasForces = false;
     if (!HostRunDevice::resume(run, saved, areForcesOthers))
         return false;
     isOnDevice = false;

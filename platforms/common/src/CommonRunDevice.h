@@ -38,6 +38,9 @@ public:
     std::vector<double> getMonitorValues() override;
     std::vector<double> getMultipliers() override;
     double computeKineticEnergy() override;
+    bool usesForcesOfOthers() override {
+        return true;
+    }
     long long getNumSolverIterations() override;
     long long getNumRescues() override;
     void save(RunState& run) override;
@@ -48,6 +51,7 @@ protected:
 
 private:
     bool canStepOnDevice();
+    bool areForcesValid();
     void ensureForces();
     int getNumWrites() const;
     void readState();
@@ -70,9 +74,10 @@ private:
     double settledTime;
     long long settledCount, knownCount;
     double groupEnergy; // of the last forces
-    int forceCount;     // of the Context's evaluations, when they were computed; -1 if they are others
-    int writeCount;     // of positions, likewise
-    bool areAtomsReordered; // since then
+    bool hasForces;     // of the state, unless what follows says otherwise
+    int writeCount;     // of positions, when they were computed
+    std::vector<int> order;  // of the atoms, likewise
+    bool areAtomsReordered; // perhaps, since then
     long long numDeviceRescues;
 };
 

@@ -3,9 +3,19 @@
 
 #include "ComputeVectors.h"
 #include "openmm/kernels.h"
+#include <cmath>
+#include <limits>
 
 using namespace OpenMMVRattle;
 using OpenMM::UpdateStateDataKernel;
+
+namespace {
+
+// GPUs add up forces in units of 2^-32 kJ/mol/nm in 64 bits. Beyond this, half of what these can hold, they are taken for no number:
+// infinity and what is none become the largest that there is.
+const double LARGEST_FORCE = 1 << 30;
+
+} // namespace
 
 ComputeVectors::ComputeVectors(OpenMM::ContextImpl& context) :
         context(context), kernel(context.getPlatform().createKernel(UpdateStateDataKernel::Name(), context)),
@@ -25,6 +35,10 @@ const ContextVectors::Vectors& ComputeVectors::getVelocities() {
 
 ContextVectors::Vectors& ComputeVectors::getForces() {
     context.getForces(forces);
+    for (OpenMM::Vec3& force : forces)
+        for (int d = 0; d < 3; d++)
+            if (!(std::fabs(force[d]) < LARGEST_FORCE))
+                force[d] = std::numeric_limits<double>::quiet_NaN();
     return forces;
 }
 

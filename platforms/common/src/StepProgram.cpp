@@ -164,7 +164,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
                                       {"FIRST_TERM", Control::FirstTerm},
                                       {"NOT_CONVERGED", Control::NotConverged},
                                       {"INVALID_MONITOR", Control::InvalidMonitor},
-                                      {"DEPENDENT_CONSTRAINTS", Control::DependentConstraints},
+                                      {"IRREGULAR", Control::Irregular},
                                       {"UNSOLVED_DENSITY", Control::UnsolvedDensity},
                                       {"NUM_CODES", Control::NumCodes},
                                       {"TRIAL_STATUS", 0},

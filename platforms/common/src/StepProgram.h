@@ -42,8 +42,8 @@ enum Setting {
     DensityRounding,  // the same where rounding allows no better
     FirstTerm
 };
-/** What makes a step fail; the slot of the cluster is above. */
-enum Failure { NotConverged, InvalidMonitor, DependentConstraints, UnsolvedDensity, NumCodes };
+/** What makes a step fail; the slot of the cluster is above. Irregular are constraints that depend on each other, and forces. */
+enum Failure { NotConverged, InvalidMonitor, Irregular, UnsolvedDensity, NumCodes };
 /** Numbers of the trial of a density. */
 const int TrialSize = 9;
 } // namespace Control

@@ -44,7 +44,7 @@ inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mi
         }
 }
 
-/** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other. */
+/** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
 inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed x[NUM_ATOMS][3], v[NUM_ATOMS][3], a[NUM_ATOMS][3], w[NUM_ATOMS], forceSquared[NUM_ATOMS];
@@ -72,7 +72,9 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
             x1[k] += r[k][d]*(v[first[k]][d] - v[second[k]][d]);
         }
     }
-    const bool isRegular = factorize_KIND(r, w, L);
+    bool isRegular = factorize_KIND(r, w, L);
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        isRegular = isRegular && forceSquared[i] >= 0;
     solve_KIND(L, x1);
     push_KIND(r, w, x1, -1, v);
     if (isStored)

@@ -19,7 +19,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
             w[d] = v[d] - halfKick*a[d];
     addParticleTerms(halfSums, forceSquared, inverseMass, w);
 #endif
-    return true;
+    return forceSquared >= 0;
 }
 
 inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed* sums) {

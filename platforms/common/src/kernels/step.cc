@@ -47,16 +47,22 @@ inline DEVICE mixed loadVelocity(GLOBAL const mixed4* RESTRICT velm, int i, mixe
     return p.w;
 }
 
-/** The acceleration M^-1 F of a particle of inverse mass w; returns |F|^2. */
+/**
+ * The acceleration M^-1 F of a particle of inverse mass w; returns |F|^2, or -1 if F is beyond what may be the sum of numbers
+ * (ComputeVectors.cpp).
+ */
 inline DEVICE mixed loadAcceleration(GLOBAL const mm_long* RESTRICT force, int paddedNumAtoms, int i, mixed w, mixed* a) {
     const mixed scale = 1/(mixed) 0x100000000;
     mixed square = 0;
+    bool isNumber = true;
     UNROLL for (int d = 0; d < 3; d++) {
-        mixed f = scale*force[i + d*paddedNumAtoms];
+        const mm_long sum = force[i + d*paddedNumAtoms];
+        const mixed f = scale*sum;
         a[d] = w*f;
         square += f*f;
+        isNumber = isNumber && sum < 0x4000000000000000 && sum > -0x4000000000000000;
     }
-    return square;
+    return isNumber ? square : (mixed) -1;
 }
 
 // ---------------------------------------------------------------------------------------------------------------- the monitors
@@ -221,7 +227,7 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
         bool isRegular = true;
         FINISH_CASES
         if (!isRegular)
-            fail(failure, step, DEPENDENT_CONSTRAINTS + NUM_CODES*slot);
+            fail(failure, step, IRREGULAR + NUM_CODES*slot);
     }
     mergeInGroup(sums, buffer);
     if (LOCAL_ID == 0 && !isFrozen)

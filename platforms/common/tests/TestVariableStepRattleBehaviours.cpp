@@ -1,7 +1,7 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "OpenCLTests.h"
+#include "GpuTests.h"
 
 #include "TestVariableStepRattleBehaviours.h"
 

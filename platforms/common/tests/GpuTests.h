@@ -1,0 +1,36 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// The tests of `tests` on a GPU platform. The program's arguments are its name, our library for it and a precision; then perhaps
+// the number of one test.
+
+#include "TestSupport.h"
+#include "openmm/Platform.h"
+
+namespace OpenMMVRattle {
+
+inline std::string& testPlatformName() {
+    static std::string name;
+    return name;
+}
+
+inline OpenMM::Platform& getTestPlatform() {
+    return OpenMM::Platform::getPlatform(testPlatformName());
+}
+
+inline int runOnPlatform(const TestList& tests, int argc, char** argv) {
+    if (argc < 4) {
+        std::cerr << argv[0] << " <platform> <library> <precision> [<test>]" << std::endl;
+        return 2;
+    }
+    testPlatformName() = argv[1];
+    OpenMM::Platform::loadPluginsFromDirectory(OpenMM::Platform::getDefaultPluginsDirectory());
+    OpenMM::Platform::loadPluginLibrary(argv[2]);
+    getTestPlatform().setPropertyDefaultValue("Precision", argv[3]);
+    TestList chosen = tests;
+    if (argc > 4)
+        chosen = {tests.at(std::stoi(argv[4]))};
+    return runTests(chosen);
+}
+
+} // namespace OpenMMVRattle
