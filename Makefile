@@ -75,8 +75,9 @@ scaling: install $(TOOLS)
 	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
 	$(BIN)/python benchmarks/scaling.py --program $(BUILD)/benchmarks/VRattleSolverBenchmark --context 200000
 
+# The tests of one file one after the other, in one process; several files at a time.
 python-test: install $(TOOLS)
-	$(BIN)/python -m pytest python/tests --junitxml="$(PYTHON_REPORT)"
+	$(BIN)/python -m pytest python/tests --numprocesses $(JOBS) --dist loadfile --junitxml="$(PYTHON_REPORT)"
 
 # The numbers that README and documentation claim, measured: gains, drift, the paper's figures. Minutes on an idle machine.
 claims: install $(TOOLS)
