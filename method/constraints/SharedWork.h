@@ -46,12 +46,15 @@ public:
         void addFailed(int other) {
             failed = std::max(failed, other);
         }
+        void addIterations(int other) {
+            iterations = std::max(iterations, other);
+        }
         void merge(const Result& other) {
             addError(other.error);
             addPieceError(other.pieceError);
             addPivot(other.pivot);
             addFailed(other.failed);
-            iterations = std::max(iterations, other.iterations);
+            addIterations(other.iterations);
         }
     };
 

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/AutomaticControl.h"
-#include "constraints/StepFailure.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -92,27 +91,22 @@ void requireFinite(double value, const char* name) {
 
 } // namespace
 
-AutomaticControl::AutomaticControl(const ConstraintSystem& system) :
-        system(system), numClusters((int) system.getClusters().size()), references(), memory(), temperature(0),
-        measured() {
+AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
+        solver(solver), system(solver.getSystem()), movingParticles(solver.getMovingParticles()),
+        numClusters((int) system.getClusters().size()), references(), memory(), temperature(0), measured() {
     vector<int> clusters(system.getNumParticles(), -1);
     for (int c = 0; c < numClusters; c++)
         for (int i : system.getClusterParticles(c))
             clusters[i] = c;
-    for (int i = 0; i < system.getNumParticles(); i++) {
-        if (system.getInverseMasses()[i] == 0)
-            continue;
+    for (int i : movingParticles) {
         if (clusters[i] < 0)
             clusters[i] = numClusters++;
-        movingParticles.push_back(i);
         clusterOfParticle.push_back(clusters[i]);
     }
     numDegreesOfFreedom = std::max(1.0, 3.0 * (double) movingParticles.size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
     netForces.resize(system.getNumParticles());
-    negativeMultipliers.resize(system.getNumConstraints());
-    jacobian.resize(system.getNumEntries());
 }
 
 // -------------------------------------------------------------------------------------------------------- the monitors
@@ -120,12 +114,7 @@ AutomaticControl::AutomaticControl(const ConstraintSystem& system) :
 // N = F - G^T Lambda
 void AutomaticControl::findNetForces(const State& state) {
     netForces = state.forces;
-    if (system.getNumConstraints() == 0)
-        return;
-    system.evaluateJacobian(state.positions, state.parameters, jacobian);
-    for (size_t k = 0; k < negativeMultipliers.size(); k++)
-        negativeMultipliers[k] = -state.multipliers[k];
-    system.addTransposed(jacobian, negativeMultipliers, netForces);
+    solver.subtractConstraintForces(state.positions, state.parameters, state.multipliers, netForces);
 }
 
 // S_c and 2K/f

@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_AUTOMATICCONTROL_H_
 #define OPENMMVRATTLE_AUTOMATICCONTROL_H_
 
-#include "constraints/ConstraintSystem.h"
+#include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include <vector>
 
@@ -60,7 +60,7 @@ public:
             mostShortSteps; // steps in a row below a tenth of the nominal one: now, and the most there were
     };
 
-    explicit AutomaticControl(const ConstraintSystem& system);
+    explicit AutomaticControl(ConstraintSolver& solver);
 
     void setSettings(const Settings& newSettings) {
         settings = newSettings;
@@ -153,8 +153,9 @@ private:
     void follow(double part);
     void raiseReferences();
 
+    ConstraintSolver& solver;
     const ConstraintSystem& system;
-    std::vector<int> movingParticles;
+    const std::vector<int>& movingParticles;
     std::vector<int> clusterOfParticle; // of each moving particle in that order
     int numClusters;
     double numDegreesOfFreedom;
@@ -165,8 +166,6 @@ private:
     double measured[NUM_MONITORS]; // by measure()
     std::vector<double> measuredSquares, scratch;
     std::vector<OpenMM::Vec3> netForces;
-    std::vector<double> negativeMultipliers;
-    ConstraintSystem::Jacobian jacobian;
 };
 
 } // namespace OpenMMVRattle

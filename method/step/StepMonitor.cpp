@@ -51,10 +51,10 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 
 } // namespace
 
-StepMonitor::StepMonitor(const ConstraintSystem& system) :
-        system(system), forces(nullptr), groupEnergy(0), appliedForceSquared(0), forceSquared(0), maxForce(0),
-        constraintForceSquared(0), blockSums(system.getBlocks().size() - 1), toSolve(system.getNumConstraints()),
-        solved(system.getNumConstraints()), velocityJacobian(system.getNumEntries()) {
+StepMonitor::StepMonitor(ConstraintSolver& solver) :
+        solver(solver), system(solver.getSystem()), forces(nullptr), groupEnergy(0), appliedForceSquared(0),
+        forceSquared(0), maxForce(0), constraintForceSquared(0), blockSums(system.getBlocks().size() - 1),
+        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()) {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms) {
@@ -262,20 +262,19 @@ double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vect
     return 0;
 }
 
-bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v,
-                               const ConstraintSystem::Jacobian& jacobian, double speed, double acceleration) const {
+bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v, double speed,
+                               double acceleration) const {
     if (!(value > 0))
         return true;
     switch (terms[index].kind) {
     case ConstraintMultipliers:
     case MultiplierPNorm:
-        return value <= findMultiplierRounding(false, v, jacobian, acceleration);
+        return value <= solver.findMultiplierRounding(false, v, acceleration);
     case ConstraintForce:
-        return value <= findMultiplierRounding(true, v, jacobian, acceleration);
+        return value <= solver.findMultiplierRounding(true, v, acceleration);
     case ConstraintAndAppliedForce:
         return areForcesNegligible(acceleration) &&
-               value * value - appliedForceSquared <=
-                   std::pow(findMultiplierRounding(true, v, jacobian, acceleration), 2);
+               value * value - appliedForceSquared <= std::pow(solver.findMultiplierRounding(true, v, acceleration), 2);
     case AppliedForce:
     case ForcePNorm:
     case MaxForce:
@@ -298,41 +297,6 @@ bool StepMonitor::areForcesNegligible(double acceleration) const {
     return true;
 }
 
-// Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
-double StepMonitor::findMultiplierRounding(bool isMassWeighted, const vector<Vec3>& v,
-                                           const ConstraintSystem::Jacobian& jacobian, double acceleration) const {
-    const double fraction = 1e-12;
-    double largest = 0;
-    const vector<double>& inverseMasses = system.getInverseMasses();
-    auto forceOn = [&](int i, double length) {
-        return fraction * (std::sqrt((*forces)[i].dot((*forces)[i])) + v[i].dot(v[i]) / (inverseMasses[i] * length));
-    };
-    for (int k = 0; k < system.getNumConstraints(); k++) {
-        if (system.isExpression(k))
-            continue;
-        const DistanceConstraint& c = system.getConstraint(k);
-        const double lighter = 1 / std::max(inverseMasses[c.particle1], inverseMasses[c.particle2]);
-        for (int i : {c.particle1, c.particle2})
-            if (inverseMasses[i] > 0)
-                largest = std::max(largest,
-                                   isMassWeighted
-                                       ? (forceOn(i, c.length) + lighter * acceleration) * std::sqrt(inverseMasses[i])
-                                       : (forceOn(i, c.length) + lighter * acceleration) / (2 * c.length));
-    }
-    for (const ConstraintSystem::ExpressionRow& row : system.getExpressionRows()) {
-        double product = 0, square = 0; // G M^-1 F without cancellation, and the diagonal of K
-        for (int entry = row.first; entry < row.end; entry++) {
-            const int i = system.getParticleOf(entry);
-            const double rowSquared = jacobian[entry].dot(jacobian[entry]);
-            product += std::sqrt(rowSquared) *
-                       (forceOn(i, ConstraintSystem::EXPRESSION_LENGTH) * inverseMasses[i] + acceleration);
-            square += rowSquared * inverseMasses[i];
-        }
-        largest = std::max(largest, product / (isMassWeighted ? std::sqrt(square) : square));
-    }
-    return largest;
-}
-
 double StepMonitor::combine(const vector<double>& values) const {
     if (terms.empty())
         return 1;
@@ -346,9 +310,9 @@ double StepMonitor::combine(const vector<double>& values) const {
     return std::sqrt(sum / sumOfWeights);
 }
 
-void StepMonitor::evaluateGradient(const vector<Vec3>& q, const ExpressionParameters& theta, const vector<Vec3>& v,
+void StepMonitor::evaluateGradient(const ExpressionParameters& theta, const vector<Vec3>& v,
                                    const vector<double>& multipliers, const vector<double>& values,
-                                   const ConstraintMatrix& matrix, vector<Vec3>& gradient) {
+                                   vector<Vec3>& gradient) {
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     std::fill(gradient.begin(), gradient.end(), Vec3());
@@ -409,13 +373,12 @@ void StepMonitor::evaluateGradient(const vector<Vec3>& q, const ExpressionParame
     if (!needsMultipliers())
         return;
     if (mustSolve) {
-        matrix.solve(toSolve);
+        solver.solveMatrix(toSolve);
         for (int k = 0; k < numConstraints; k++)
             solved[k] += toSolve[k];
     }
     // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-    system.evaluateVelocityJacobian(q, v, theta, velocityJacobian);
     for (double& x : solved)
         x *= 2;
-    system.addTransposed(velocityJacobian, solved, gradient);
+    solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
 }

@@ -4,8 +4,7 @@
 #ifndef OPENMMVRATTLE_STEPMONITOR_H_
 #define OPENMMVRATTLE_STEPMONITOR_H_
 
-#include "constraints/ConstraintMatrix.h"
-#include "constraints/ConstraintSystem.h"
+#include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include <cmath>
 #include <vector>
@@ -42,7 +41,7 @@ public:
         double order = 8; // p of the p-norms, of no meaning to others
     };
 
-    explicit StepMonitor(const ConstraintSystem& system);
+    explicit StepMonitor(ConstraintSolver& solver);
     void setTerms(const std::vector<Term>& terms);
     const std::vector<Term>& getTerms() const {
         return terms;
@@ -119,34 +118,30 @@ public:
      * @param speed           one that changes no position by more than rounding in a step (nm/ps)
      * @param acceleration    the same of an acceleration (nm/ps^2)
      */
-    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v,
-                      const ConstraintSystem::Jacobian& jacobian, double speed, double acceleration) const;
+    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v, double speed,
+                      double acceleration) const;
     /** u, the combination of the values; 1 if there is no term. A term without a reference counts as if it had its value there. */
     double combine(const std::vector<double>& values) const;
     /**
-     * du/dv at the state of the last evaluate().
+     * du/dv at the state of the last evaluate(), at the positions of the solver.
      *
-     * @param q              the positions
      * @param theta          the parameters of the expressions
      * @param v              as in evaluate()
      * @param multipliers    as in evaluate()
      * @param values         what evaluate() gave
-     * @param matrix         the factorised K(q)
      * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
      */
-    void evaluateGradient(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
-                          const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
-                          const std::vector<double>& values, const ConstraintMatrix& matrix,
+    void evaluateGradient(const ExpressionParameters& theta, const std::vector<OpenMM::Vec3>& v,
+                          const std::vector<double>& multipliers, const std::vector<double>& values,
                           std::vector<OpenMM::Vec3>& gradient);
 
 private:
     double squareOf(const OpenMM::Vec3& force, int particle) const;
     bool areForcesNegligible(double acceleration) const;
-    double findMultiplierRounding(bool isMassWeighted, const std::vector<OpenMM::Vec3>& v,
-                                  const ConstraintSystem::Jacobian& jacobian, double acceleration) const;
     double evaluateTerm(size_t index, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
     int findFastest(const std::vector<OpenMM::Vec3>& v) const;
+    ConstraintSolver& solver;
     const ConstraintSystem& system;
     std::vector<Term> terms;
     const std::vector<OpenMM::Vec3>* forces;
@@ -154,7 +149,6 @@ private:
     std::vector<double> forcePNorms; // of the terms of that kind
     std::vector<double> blockSums;   // of the squares of the forces
     std::vector<double> toSolve, solved;
-    ConstraintSystem::Jacobian velocityJacobian;
 };
 
 } // namespace OpenMMVRattle

@@ -25,33 +25,28 @@ const double SMALL_JUMP = 0.01;
 
 VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                  const vector<ExpressionConstraint>& expressions) :
-        system(masses, constraints, expressions), matrix(system), newtonMatrix(system), monitor(system),
-        automatic(system), work(system), settings(), groupEnergy(0), rho(1), u(1), hasDensity(false),
-        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isStartedNow(false),
-        isCalm(false), factorScope(NoFactor), isMonitorCurrent(false), stepKind(First), rhoNext(1), stepNext(0),
-        kickNext(0), areParametersChanging(false), densityScale(1), isJump(false), isRescued(false), numIterations(0),
-        numRescues(0), lastError(0) {
+        solver(masses, constraints, expressions), system(solver.getSystem()),
+        movingParticles(solver.getMovingParticles()), monitor(solver), automatic(solver), settings(), groupEnergy(0),
+        rho(1), u(1), hasDensity(false), hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0),
+        firstDensity(0), isStartedNow(false), isCalm(false), isMonitorCurrent(false), stepKind(First), rhoNext(1),
+        stepNext(0), kickNext(0), areParametersChanging(false), densityScale(1), isJump(false), isRescued(false),
+        numNewtonIterations(0), numRescues(0) {
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
-    for (int i = 0; i < numParticles; i++)
-        if (masses[i] > 0)
-            movingParticles.push_back(i);
     for (vector<Vec3>* vectors :
          {&w, &qNext, &wNext, &vNext, &acceleration, &gradient, &halfStepChange, &qBack, &wBack, &vBack, &forceBack})
         vectors->resize(numParticles);
     for (vector<double>* numbers :
-         {&lambda, &rightSide, &multiplierOffset, &appliedTerm, &lambdaNext, &rightSideNext, &appliedTermNext,
-          &lambdaHalf, &rightSideHalf, &lambdaRate, &multiplierTrial, &rightSideTrial, &residual, &correction,
-          &coupling, &response, &lambdaOnStep, &lambdaBack, &rightSideBack})
+         {&lambda, &rightSide, &multiplierOffset, &lambdaNext, &rightSideNext, &atHalfStep.multipliers,
+          &atHalfStep.rightSide, &atHalfStep.rate, &multiplierTrial, &rightSideTrial, &correction, &coupling, &response,
+          &lambdaOnStep, &lambdaBack, &rightSideBack})
         numbers->resize(numConstraints);
     theta = thetaNext = thetaHalf = thetaBack = system.getGivenParameters();
     target = parameterChange = theta.values;
-    isPieceEliminated.resize(system.getPieces().size());
-    for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
-        rows->resize(system.getNumEntries());
+    solver.moveTo(q, theta, force);
 }
 
 void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
-    work.setParallel(newParallel, numThreads);
+    solver.setParallel(newParallel, numThreads);
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
@@ -78,6 +73,7 @@ void VRattleDynamics::setSettings(const Settings& newSettings) {
     for (size_t i = 0; i < terms.size() && sameDensity; i++)
         sameDensity = terms[i].reference == monitor.getTerms()[i].reference;
     settings = newSettings;
+    solver.setTolerance(settings.tolerance);
     setControlSettings();
     monitor.setTerms(terms);
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
@@ -167,7 +163,7 @@ void VRattleDynamics::requireConstraintsFor(const vector<StepMonitor::Term>& ter
 void VRattleDynamics::adoptParameters() {
     theta.values = target;
     areParametersChanging = false;
-    factorScope = NoFactor;
+    solver.moveTo(q, theta, force);
 }
 
 void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
@@ -192,7 +188,7 @@ void VRattleDynamics::beginAt(const vector<Vec3>& positions, const vector<Vec3>&
     densityOffset = 0;
     std::fill(multiplierOffset.begin(), multiplierOffset.end(), 0.0);
     try {
-        evaluateOnStep(q, theta, velocities, force, groupEnergy, 0.0, v, lambda, rightSide, values, false);
+        evaluateOnStep({q, velocities, force, theta, 0.0, v, lambda, rightSide, nullptr}, groupEnergy, values);
     }
     catch (...) {
         putBack(before);
@@ -278,6 +274,7 @@ VRattleDynamics::Kept VRattleDynamics::keep() const {
 
 void VRattleDynamics::putBack(const Kept& kept) {
     settings = kept.settings;
+    solver.setTolerance(settings.tolerance);
     setControlSettings();
     monitor.setTerms(settings.terms);
     density = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
@@ -288,7 +285,7 @@ void VRattleDynamics::putBack(const Kept& kept) {
     target = kept.target;
     rightSide = kept.rightSide;
     setMemory(kept.memory);
-    factorScope = NoFactor;
+    solver.moveTo(q, theta, force);
     isMonitorCurrent = false;
 }
 
@@ -343,7 +340,7 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
 }
 
 bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
-    ensureFactor(NoFactor);
+    ensureMonitor();
     if (!system.isTranslationInvariant() || movingParticles.empty())
         return false;
     const Vec3 shift = velocities[movingParticles[0]] - v[movingParticles[0]];
@@ -370,7 +367,7 @@ void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     vector<Vec3>& change = vNext;
     for (int i : movingParticles)
         change[i] = velocities[i] - v[i];
-    projectVelocities(change);
+    solver.projectVelocities(change);
     double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
     for (int i : movingParticles) {
         changeSquared += system.getMasses()[i] * change[i].dot(change[i]);
@@ -398,7 +395,7 @@ void VRattleDynamics::changeForces(vector<Vec3>& forces, double energy) {
     auto exchange = [&] {
         force.swap(forces);
         std::swap(groupEnergy, energy);
-        factorScope = NoFactor;
+        solver.moveTo(q, theta, force);
         isMonitorCurrent = false;
     };
     exchange();
@@ -436,21 +433,20 @@ void VRattleDynamics::takeTrialValues() {
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
 void VRattleDynamics::formHalfStepVelocities() {
-    ensureFactor(FullFactor);
     const double kick = 0.5 * settings.stepSize / rho;
     const vector<double>& inverseMasses = system.getInverseMasses();
     for (int i : movingParticles)
         w[i] = v[i] - force[i] * (kick * inverseMasses[i]);
-    system.addTransposedOverMass(jacobian, lambda, kick, w);
+    solver.addTransposedOverMass(lambda, kick, w);
     hasHalfStepValue = false;
 }
 
 // ------------------------------------------------------------------------------------------------------- the steps
 
 double VRattleDynamics::step(double maxStep) {
-    work.beginStep();
+    solver.beginStep();
     isRescued = false;
-    ensureFactor(NoFactor); // of a step before that has failed, the monitor may have the forces still
+    ensureMonitor(); // of a step before that has failed, the monitor may have the forces still
     isStartedNow = false;
     prepareParameters();
     findJump();
@@ -476,7 +472,7 @@ double VRattleDynamics::step(double maxStep) {
         // A step of plain RATTLE from the on-step state.
         if (isShortened)
             stepKind = Shortened;
-        const Trial trial = {v, 0.5 * stepNext, stepNext};
+        const ConstraintSolver::Trial trial = trialTo(0.5 * stepNext, stepNext, v);
         if (!solvePositions(trial, true))
             throwNotConverged(trial);
     }
@@ -529,14 +525,10 @@ void VRattleDynamics::findJump() {
     }
     if (!isSudden)
         return;
-    ensureFactor(FullFactor);
-    system.multiply(jacobian, v, correction);
-    system.addParameterMotion(q, thetaHalf, correction);
-    matrix.solve(correction);
     double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
     for (int i : movingParticles)
         vNext[i] = Vec3();
-    system.addTransposedOverMass(jacobian, correction, -1.0, vNext);
+    solver.addProjection(v, thetaHalf, vNext);
     for (int i : movingParticles) {
         changeSquared += system.getMasses()[i] * vNext[i].dot(vNext[i]);
         vNext[i] += v[i];
@@ -557,14 +549,15 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
         startValues = hasBack && needsHalfStepValue() ? evaluateHalfSteps() : values;
     }
     const bool withHalfStep = needsHalfStepValue() && stepKind != Shortened;
-    evaluateOnStep(qNext, thetaNext, wNext, forces, energy, kickNext, vNext, lambdaOnStep, rightSideNext, valuesNext,
-                   withHalfStep);
+    evaluateOnStep({qNext, wNext, forces, thetaNext, kickNext, vNext, lambdaOnStep, rightSideNext,
+                    withHalfStep ? &atHalfStep : nullptr},
+                   energy, valuesNext);
     if (isStart && !startDensityFrom(startValues, backValues, hasBack))
         return false;
     if (settings.isAutomatic)
         automatic.measure({qNext, thetaNext, vNext, forces, lambdaOnStep}, wNext, stepNext, force);
     // From here on nothing fails.
-    work.endStep();
+    solver.endStep();
     if (stepKind == First && isCalm)
         for (size_t k = 0; k < values.size(); k++)
             if (monitor.getTerms()[k].reference == 0 && !isNegligible[k])
@@ -588,9 +581,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     lambda.swap(lambdaOnStep);
     rightSide.swap(rightSideNext);
     values.swap(valuesNext);
-    jacobian.swap(jacobianNext);
-    appliedTerm.swap(appliedTermNext);
-    factorScope = GeneralFactor;
+    solver.moveToEnd();
     monitor.forcesMoved(force);
     isMonitorCurrent = true;
     if (stepKind == First) {
@@ -633,7 +624,7 @@ void VRattleDynamics::acceptAutomatic() {
 }
 
 void VRattleDynamics::reverse() {
-    ensureFactor(NoFactor);
+    ensureMonitor();
     if (hasDensity) {
         const long long rescuesBefore = numRescues;
         prepareParameters();
@@ -679,8 +670,6 @@ double VRattleDynamics::findFirstDensity() {
     const vector<StepMonitor::Term>& terms = monitor.getTerms();
     if (settings.isFixedStep || terms.empty())
         return 1;
-    if (system.getFirstGeneral() < system.getNumConstraints())
-        ensureFactor(GeneralFactor); // for the Jacobian
     double farthest = 0;
     for (int i : movingParticles)
         farthest = std::max(farthest, std::sqrt(q[i].dot(q[i])));
@@ -688,7 +677,7 @@ double VRattleDynamics::findFirstDensity() {
     isNegligible.resize(terms.size());
     bool areAllNegligible = true, areAllUnknown = true, areAllKnown = true;
     for (size_t k = 0; k < terms.size(); k++) {
-        isNegligible[k] = monitor.isNegligible((int) k, values[k], v, jacobian, speed, speed / settings.stepSize);
+        isNegligible[k] = monitor.isNegligible((int) k, values[k], v, speed, speed / settings.stepSize);
         areAllNegligible = areAllNegligible && isNegligible[k];
         const bool isKnown = terms[k].reference > 0;
         areAllUnknown = areAllUnknown && !isKnown;
@@ -706,15 +695,7 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
     setRates(thetaBack, stepNext);
     for (size_t k = 0; k < target.size(); k++)
         thetaBack.values[k] = theta.values[k] - parameterChange[k];
-    auto swapBack = [&] {
-        qNext.swap(qBack);
-        wNext.swap(wBack);
-        std::swap(thetaNext, thetaBack);
-    };
-    swapBack();
-    bool isSolved = solvePositions({v, -0.5 * stepNext, -stepNext}, true);
-    swapBack();
-    if (!isSolved)
+    if (!solvePositions({v, -0.5 * stepNext, -stepNext, thetaBack, qBack, wBack, lambdaNext}, true))
         return false;
     double product = 0, square = 0;
     for (int i : movingParticles) {
@@ -726,8 +707,8 @@ bool VRattleDynamics::evaluateBackwards(const vector<Vec3>& forces, double energ
     for (int i = 0; i < system.getNumParticles(); i++)
         forceBack[i] = force[i] + (forces[i] - force[i]) * alpha;
     try {
-        evaluateOnStep(qBack, thetaBack, wBack, forceBack, groupEnergy + alpha * (energy - groupEnergy), -kickNext,
-                       vBack, lambdaBack, rightSideBack, backValues, false);
+        evaluateOnStep({qBack, wBack, forceBack, thetaBack, -kickNext, vBack, lambdaBack, rightSideBack, nullptr},
+                       groupEnergy + alpha * (energy - groupEnergy), backValues);
     }
     catch (const StepFailure&) {
         return false; // no state to look back at

@@ -4,12 +4,7 @@
 #ifndef OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 #define OPENMMVRATTLE_VRATTLEDYNAMICS_H_
 
-#include "constraints/ClusterBatch.h"
-#include "constraints/ConstraintMatrix.h"
-#include "constraints/ConstraintSystem.h"
-#include "constraints/NewtonMatrix.h"
-#include "constraints/SharedWork.h"
-#include "constraints/StepFailure.h"
+#include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include "step/AutomaticControl.h"
 #include "step/StepDensity.h"
@@ -71,7 +66,7 @@ public:
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
 
-    typedef SharedWork::Parallel Parallel;
+    typedef ConstraintSolver::Parallel Parallel;
     /**
      * Let threads share the clusters, and the pieces of large ones, where that is faster. Results do not depend on the number of
      * threads, to the last bit.
@@ -121,7 +116,7 @@ public:
      * G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
      */
     void setParameters(int expression, const std::map<std::string, double>& parameters) {
-        system.writeParameters(expression, parameters, target);
+        getConstraintSystem().writeParameters(expression, parameters, target);
     }
     /** theta[n], those in force, and the rates of the step that has led to them. */
     const ExpressionParameters& getParameters() const {
@@ -208,7 +203,7 @@ public:
     void reverse();
 
     const ConstraintSystem& getConstraintSystem() const {
-        return system;
+        return solver.getSystem();
     }
     /** q[n]. */
     const std::vector<OpenMM::Vec3>& getPositions() const {
@@ -245,7 +240,7 @@ public:
         return lambda;
     }
     long long getNumIterations() const {
-        return numIterations;
+        return solver.getNumIterations() + numNewtonIterations;
     }
     long long getNumRescues() const {
         return numRescues;
@@ -253,8 +248,6 @@ public:
 
 private:
     enum StepKind { Regular, First, Shortened };
-    enum SolveResult { Converged, TooSlow, NotConverged, NotPositive };
-    enum FactorScope { NoFactor, GeneralFactor, FullFactor };
     void requireConstraintsFor(const std::vector<StepMonitor::Term>& terms) const;
     bool takeAutomaticReferences(const Settings& newSettings);
     void setControlSettings();
@@ -273,67 +266,18 @@ private:
     void setRates(ExpressionParameters& parameters, double size) const;
     void findJump();
 
-    void ensureFactor(FactorScope scope);
+    void ensureMonitor();
     void formHalfStepVelocities();
     double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& parameters);
-    void projectVelocities(std::vector<OpenMM::Vec3>& velocities);
-    void evaluateOnStep(const std::vector<OpenMM::Vec3>& positions, const ExpressionParameters& parameters,
-                        const std::vector<OpenMM::Vec3>& halfStep, const std::vector<OpenMM::Vec3>& forces,
-                        double energy, double kick, std::vector<OpenMM::Vec3>& velocities,
-                        std::vector<double>& multipliers, std::vector<double>& rightSides,
-                        std::vector<double>& monitorValues, bool withHalfStep);
-    /** The on-step state that is computed, and what from. */
-    struct OnStep {
-        const std::vector<OpenMM::Vec3>&positions, &halfStep, &forces;
-        const ExpressionParameters& parameters;
-        std::vector<OpenMM::Vec3>& velocities;
-        std::vector<double>&multipliers, &rightSides;
-        double kick;
-        bool withHalfStep;
-    };
-    int evaluateOnStepGeneral(const OnStep& state, const ConstraintSystem::Part& part);
-    int evaluateOnStepPieces(const OnStep& state);
-    int beginVelocities(const OnStep& state, const ConstraintSystem::Part& part);
-    void beginMultipliers(const OnStep& state, const ConstraintSystem::Part& part);
-    void formMultiplierEquations(const OnStep& state, const ConstraintSystem::Part& part);
-    void beginRates(const OnStep& state, const ConstraintSystem::Part& part);
-    void formRateEquations(const OnStep& state, const ConstraintSystem::Part& part);
+    void evaluateOnStep(const ConstraintSolver::OnStep& state, double energy, std::vector<double>& monitorValues);
     double evaluateRate();
-    bool projectByChord(const std::vector<OpenMM::Vec3>& positions);
-    bool projectByNewton(const std::vector<OpenMM::Vec3>& positions);
-
-    /** A step from q: half-step velocities start + kick acceleration, positions q + drift of these. */
-    struct Trial {
-        const std::vector<OpenMM::Vec3>& start;
-        double kick, drift;
-    };
-    StepArrays stepArrays(const Trial& trial);
-    void startMultipliers(bool withOffset, int first, int end);
-    void startMultipliers(bool withOffset);
-    void computeTrial(const Trial& trial, const int* firstParticle, const int* endParticle,
-                      const ConstraintSystem::Part& part, bool withVelocities);
-    void computeTrial(const Trial& trial);
-    void computeTrial(const Trial& trial, const ConstraintSystem::Part& part, bool withVelocities);
-    void moveFreeParticle(int i, const Trial& trial);
-    bool solvePositions(const Trial& trial, bool isFromOnStep);
-    static bool isLastIteration(int iteration, double error, double previous, double tolerance);
-    double solveGeneral(const ConstraintSystem::Part& part, const Trial& trial, double tolerance, int& iterations);
-    void updateMultipliers(const Trial& trial, int first, int end);
-    double evaluatePiece(const ConstraintSystem::Part& piece, const Trial& trial, double tolerance, bool isFirst);
-    double solvePieces(const Trial& trial, double error, double tolerance, int& iterations);
-    bool solvePositionsByNewton(const Trial& trial);
-    bool iterateNewton(const Trial& trial);
-    SolveResult solveCoupled();
-    double beginCoupledPass(const ConstraintSystem::Part& part, const Trial& trial);
-    double formCoupledEquations(const ConstraintSystem::Part& part, const Trial& trial);
-    double coupledPassGeneral(const ConstraintSystem::Part& part, const Trial& trial);
-    double finishCoupledPassOfPieces(const Trial& trial);
-    SolveResult solveCoupledByNewton();
+    ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
+    bool solvePositions(const ConstraintSolver::Trial& trial, bool isFromOnStep);
+    bool solveCoupled();
+    bool solveCoupledByNewton();
     double solveRegular();
     void keepOffsets();
-    [[noreturn]] void throwNotConverged(const Trial& trial);
-    std::string explainNotConverged(const std::vector<OpenMM::Vec3>& from,
-                                    const std::vector<OpenMM::Vec3>& displacement, const std::string& wayOut);
+    [[noreturn]] void throwNotConverged(const ConstraintSolver::Trial& trial);
 
     double findFirstDensity();
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
@@ -342,15 +286,13 @@ private:
     void scaleReferences(const std::vector<double>& startValues, const std::vector<double>& backValues);
     static double startValue(double start, double ahead, const double* back);
 
-    ConstraintSystem system;
-    ConstraintMatrix matrix;
-    NewtonMatrix newtonMatrix;
+    ConstraintSolver solver;
+    const ConstraintSystem& system;
+    const std::vector<int>& movingParticles;
     StepMonitor monitor;
     StepDensity density;
     AutomaticControl automatic;
-    SharedWork work;
     Settings settings;
-    std::vector<int> movingParticles;
 
     // The state between two steps.
     std::vector<OpenMM::Vec3> q, v, w, force;
@@ -369,11 +311,7 @@ private:
     std::vector<char> isNegligible; // each monitor, at the first step
     std::vector<double> referencesBefore; // the first step, as long as firstDensity is known
 
-    // G(q[n]), G M^-1 F and the factor of the matrix, as far as the scope says. The batches do without them.
-    FactorScope factorScope;
     bool isMonitorCurrent; // whether the monitor has the forces at q[n]
-    ConstraintSystem::Jacobian jacobian;
-    std::vector<double> appliedTerm;
 
     // The step in progress.
     StepKind stepKind;
@@ -385,11 +323,10 @@ private:
     ExpressionParameters thetaNext, thetaHalf;
     double densityScale; // by which u and rho change where the parameters begin to move, or stop
     bool isJump; // whether that changes the velocities much
-    std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext, appliedTermNext;
-    std::vector<double> lambdaHalf, rightSideHalf, valuesHalf, lambdaRate;
-    std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, residual, correction, coupling, response;
-    ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
-    std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the correction of a piece
+    std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext;
+    ConstraintSolver::HalfStep atHalfStep;
+    std::vector<double> valuesHalf;
+    std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, correction, coupling, response;
 
     // Work space of the start.
     std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
@@ -397,8 +334,7 @@ private:
     std::vector<double> lambdaBack, rightSideBack;
 
     bool isRescued; // by the step in progress
-    long long numIterations, numRescues;
-    double lastError; // the largest relative error of a constraint that the last iteration left
+    long long numNewtonIterations, numRescues; // those of (3.14)
 };
 
 } // namespace OpenMMVRattle

@@ -39,51 +39,43 @@ struct Example {
 class Evaluation {
 public:
     Evaluation(const Example& e, vector<StepMonitor::Term> terms, double order) :
-            e(e), system(e.masses, e.constraints, e.expressions), theta(system.getGivenParameters()), matrix(system),
-            monitor(system), jacobian(system.getNumEntries()), applied(system.getNumConstraints()),
-            multipliers(system.getNumConstraints()) {
-        system.evaluateJacobian(e.positions, theta, jacobian);
-        matrix.factorize(jacobian);
-        system.multiplyOverMass(jacobian, e.forces, applied);
+            e(e), solver(e.masses, e.constraints, e.expressions), theta(solver.getSystem().getGivenParameters()),
+            monitor(solver), multipliers(solver.getSystem().getNumConstraints()), rightSide(multipliers) {
+        solver.moveTo(e.positions, theta, e.forces);
         for (StepMonitor::Term& term : terms)
             term.order = order;
         monitor.setTerms(terms);
         monitor.setForces(e.forces, 4.2);
     }
     double u(const vector<Vec3>& v) {
-        system.evaluateCurvature(e.positions, v, theta, multipliers);
-        for (size_t k = 0; k < multipliers.size(); k++)
-            multipliers[k] += applied[k];
-        rightSide = multipliers;
-        matrix.solve(multipliers);
+        solver.findMultipliers(v, theta, multipliers, rightSide);
         monitor.evaluate(v, multipliers, rightSide, values);
         return monitor.combine(values);
     }
     // du along a change of v, with the change of Lambda that goes with it: 2 K^-1 G(v) dv
     double rate(const vector<Vec3>& v, const vector<Vec3>& change) {
         u(v);
+        const ConstraintSystem& system = solver.getSystem();
         vector<double> multiplierRate(multipliers.size());
         ConstraintSystem::Jacobian velocityJacobian(system.getNumEntries());
         system.evaluateVelocityJacobian(e.positions, v, theta, velocityJacobian);
         system.multiply(velocityJacobian, change, multiplierRate);
         for (double& x : multiplierRate)
             x *= 2;
-        matrix.solve(multiplierRate);
+        solver.solveMatrix(multiplierRate);
         return monitor.evaluateRate(v, multipliers, rightSide, values, change, multiplierRate);
     }
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
         vector<Vec3> result(v.size());
-        monitor.evaluateGradient(e.positions, theta, v, multipliers, values, matrix, result);
+        monitor.evaluateGradient(theta, v, multipliers, values, result);
         return result;
     }
     const Example& e;
-    ConstraintSystem system;
+    ConstraintSolver solver;
     ExpressionParameters theta;
-    ConstraintMatrix matrix;
     StepMonitor monitor;
-    ConstraintSystem::Jacobian jacobian;
-    vector<double> applied, multipliers, rightSide, values;
+    vector<double> multipliers, rightSide, values;
 };
 
 static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
@@ -162,12 +154,12 @@ void testNegligibleMultipliers() {
     Evaluation evaluation(
         e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
     evaluation.u(e.velocities);
-    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian, 0.0, 0.0));
-    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian, 0.0, 0.0));
+    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, 0.0, 0.0));
+    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, 0.0, 0.0));
     e.velocities[0] = Vec3(0.3, 0.4001, 0);
     evaluation.u(e.velocities);
-    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, evaluation.jacobian, 0.0, 0.0));
-    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, evaluation.jacobian, 0.0, 0.0));
+    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, 0.0, 0.0));
+    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, 0.0, 0.0));
 }
 
 void testBounds() {

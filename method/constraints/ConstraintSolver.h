@@ -1,0 +1,262 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_CONSTRAINTSOLVER_H_
+#define OPENMMVRATTLE_CONSTRAINTSOLVER_H_
+
+#include "constraints/ClusterBatch.h"
+#include "constraints/ConstraintMatrix.h"
+#include "constraints/ConstraintSystem.h"
+#include "constraints/NewtonMatrix.h"
+#include "constraints/SharedWork.h"
+#include "constraints/StepFailure.h"
+#include "openmm/Vec3.h"
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * All that a method of integration asks for of constraints. How they are solved, as batches of small clusters, general ones or
+ * pieces of large ones, by which iteration, and on how many threads, is known here alone; results do not depend on the number of
+ * threads, to the last bit.
+ *
+ * It knows no densities. A method moves it to the positions of a step, tries a step from there, and completes it with the forces at
+ * its end:
+ *
+ *     solver.moveTo(q, theta, force);                    // G, K and G M^-1 F there, as they are needed
+ *     solver.solvePositions({start, kick, drift, thetaNext, qNext, wNext, lambda}, {Lambda, nullptr, margin});
+ *     ... compute the forces at qNext ...
+ *     solver.finish({qNext, wNext, forceNext, thetaNext, kick, v, Lambda, rightSide, nullptr});
+ *     ... let q, theta and force be those of the end, by swapping the vectors ...
+ *     solver.moveToEnd();                                // or moveTo() with other ones
+ *
+ * The first solves g(q+) = 0 with w+ = start + kick M^-1 (F - G(q)^T lambda), q+ = q + drift w+: a kick and a drift in one. What start
+ * has across the constraints is absorbed by lambda, so that it need not be projected. A drift alone is one with forces that are zero
+ * and any kick > 0, whose impulse -kick G^T lambda is the constraints'. The second kicks once more, projects the velocities, and finds
+ * the multipliers Lambda of the state (4.3); with forces of zero, or a kick of zero, it is a projection alone. So a step of
+ * RATTLE is those two with drift = h and kick = h/2 both times, and that of another splitting as many pairs as it has drifts.
+ *
+ * Vectors of particles are in the order of the particles, multipliers in the internal order of ConstraintSystem. Particles of mass
+ * zero are written to by nothing here.
+ */
+class ConstraintSolver {
+public:
+    typedef std::vector<OpenMM::Vec3> Vectors;
+    typedef SharedWork::Parallel Parallel;
+
+    ConstraintSolver(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                     const std::vector<ExpressionConstraint>& expressions = {});
+    ConstraintSolver(const ConstraintSolver&) = delete;
+    /** The constraints themselves: numbers, masses, clusters, units and names. */
+    const ConstraintSystem& getSystem() const {
+        return system;
+    }
+    /** The particles with mass. */
+    const std::vector<int>& getMovingParticles() const {
+        return movingParticles;
+    }
+    /** Let threads share the work where that is faster. */
+    void setParallel(const Parallel& parallel, int numThreads) {
+        work.setParallel(parallel, numThreads);
+    }
+    /** The relative error of a constraint that is no error. */
+    void setTolerance(double newTolerance) {
+        tolerance = newTolerance;
+    }
+    /** Whether threads are to share the work is found out step by step. */
+    void beginStep() {
+        work.beginStep();
+    }
+    void endStep() {
+        work.endStep();
+    }
+    /** How many times multipliers, or positions that were projected, have been corrected. */
+    long long getNumIterations() const {
+        return numIterations;
+    }
+
+    // ------------------------------------------------------------------------------------- at the positions of a step
+
+    /**
+     * Move to positions, parameters of the expressions there, and forces. All three stay the caller's: they must live, and not change
+     * until there is another call of this.
+     */
+    void moveTo(const Vectors& q, const ExpressionParameters& theta, const Vectors& force);
+    /** Lambda(q,p) = K^-1 (g''(v,v) + G M^-1 F) (4.3) for any velocities; rightSide is K Lambda. */
+    void findMultipliers(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& multipliers,
+                         std::vector<double>& rightSide);
+    /** v -= M^-1 G^T K^-1 G v, the nearest velocities along the constraints. */
+    void projectVelocities(Vectors& v);
+    /** result -= M^-1 G^T K^-1 (G v + dg/dtheta . dtheta/dt): what brings v to where parameters that move want it. */
+    void addProjection(const Vectors& v, const ExpressionParameters& theta, Vectors& result);
+    /** result += scale M^-1 G^T x */
+    void addTransposedOverMass(const std::vector<double>& x, double scale, Vectors& result);
+    /** result = G M^-1 f */
+    void multiplyOverMass(const Vectors& f, std::vector<double>& result);
+    /** x = K^-1 x */
+    void solveMatrix(std::vector<double>& x);
+    /** result += G(v)^T x, G(v) being the matrix with the rows (d^2g/dq^2 v)^T */
+    void addVelocityJacobianTransposed(const Vectors& v, const ExpressionParameters& theta,
+                                       const std::vector<double>& x, Vectors& result);
+    /** The size that multipliers have by rounding alone, in users' units or, if they are weighted by masses, as M^(-1/2) G^T Lambda. */
+    double findMultiplierRounding(bool isMassWeighted, const Vectors& v, double acceleration);
+
+    // ------------------------------------------------------------------------------------------------- a step from there
+
+    /** A step that is tried: w+ = start + kick M^-1 (F - G^T lambda) (3.10), q+ = q + drift w+ (3.9). */
+    struct Trial {
+        const Vectors& start;
+        double kick, drift; // ps
+        const ExpressionParameters& parameters; // at the end
+        // What is found.
+        Vectors &positions, &velocities; // q+ and w+
+        std::vector<double>& multipliers; // lambda
+    };
+    /** Where the iteration for lambda begins, and where it ends. */
+    struct Guess {
+        const std::vector<double>& multipliers;
+        const std::vector<double>* offset; // is added to them; or null
+        double
+            margin; // the fraction of the tolerance that is aimed at; where rounding forbids it, the tolerance itself will do
+    };
+    /**
+     * Solve g(q+) = 0 (3.11), by chord iterations with K(q), and where they fail by Newton's. There is at least one update.
+     *
+     * @return whether it is solved; if not, explainFailure() says what is in the way
+     */
+    bool solvePositions(const Trial& trial, const Guess& guess);
+    /** Begin with a guess without that iteration. */
+    void guess(const Trial& trial, const Guess& guess);
+    std::string explainFailure(const Trial& trial);
+
+    /** What (3.14) wants to know of a trial. */
+    struct Coupled {
+        const ExpressionParameters& parameters; // theta[n] with the rates of the trial
+        std::vector<double>&multipliers, &rightSide; // Lambda(q,p+) and K times it
+    };
+    /** Begin with a guess, for coupledPass(). */
+    void beginCoupled(const Trial& trial, const Guess& guess);
+    /**
+     * One chord iteration for a problem in which more is unknown than lambda. The multipliers get the correction that the pass
+     * before has found; kick and drift may be others than there.
+     *
+     * @return the largest relative error of a constraint at the trial's positions
+     */
+    double coupledPass(const Trial& trial, const Coupled& coupled);
+
+    // Newton's iteration for such a problem, whose equations in lambda are A dlambda = -g + ..., A = -kick drift G(q+) M^-1 G(q)^T.
+    /** w+, q+ and g(q+) for the trial's multipliers; returns the largest relative error. */
+    double evaluate(const Trial& trial);
+    /** Form A after evaluate(); returns whether it is regular. */
+    bool linearize(const Trial& trial);
+    /** x = -A^-1 g */
+    void findUpdate(const Trial& trial, std::vector<double>& x);
+    /** x = A^-1 G(q+) dq */
+    void findResponse(const Trial& trial, const Vectors& dq, std::vector<double>& x);
+
+    // --------------------------------------------------------------------------------------------------------- its end
+
+    /** The multipliers at half-step velocities. */
+    struct HalfStep {
+        std::vector<double> multipliers, rightSide; // Lambda(q,p-) and K times it
+        std::vector<double> rate; // the derivative of Lambda(q,p) along dp = F - G^T Lambda
+    };
+    /** The end of a step: (3.12)-(3.13), v = w + kick M^-1 F, projected, and Lambda(q,p) there. */
+    struct OnStep {
+        const Vectors &positions, &halfStep, &forces; // q, w and F
+        const ExpressionParameters& parameters;
+        double kick; // ps
+        // What is found.
+        Vectors& velocities; // v
+        std::vector<double>&multipliers, &rightSide; // Lambda and K Lambda
+        HalfStep* atHalfStep; // or null if it is not wanted
+    };
+    /** What is done along with a pass, while the processor's caches have the particles of a block. Several threads may do it at once. */
+    class Observer {
+    public:
+        virtual ~Observer() {
+        }
+        virtual void see(int block) = 0;
+    };
+    /**
+     * Complete a step. The positions of moveTo() remain, but what was known there has to be formed again.
+     *
+     * @throws StepFailure    if the constraints have become dependent
+     */
+    void finish(const OnStep& state, Observer* observer = nullptr);
+    /** After finish(): the vectors of moveTo() hold now what its positions, parameters and forces were. */
+    void moveToEnd();
+
+    // ----------------------------------------------------------------------------------------------------- anywhere
+
+    /**
+     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints; those that
+     * do so to the tolerance are left as they are. What moveTo() has moved to has to be formed again.
+     *
+     * @return whether the positions were changed
+     * @throws StepFailure    if there is no such configuration nearby
+     */
+    bool projectPositions(Vectors& positions, const ExpressionParameters& theta);
+    /** forces -= G(q)^T x */
+    void subtractConstraintForces(const Vectors& q, const ExpressionParameters& theta, const std::vector<double>& x,
+                                  Vectors& forces);
+    /** accelerations -= M^-1 G(q)^T x */
+    void subtractConstraintAccelerations(const Vectors& q, const ExpressionParameters& theta,
+                                         const std::vector<double>& x, Vectors& accelerations);
+
+private:
+    typedef ConstraintSystem::Part Part;
+    typedef ConstraintSystem::CutCluster CutCluster;
+    typedef SharedWork::Result Result;
+    enum FactorScope { NoFactor, GeneralFactor, FullFactor };
+    struct Pass;
+    struct ChordPass;
+    struct CoupledPass;
+    struct FinishPass;
+    template <class Each> Result run(const Each& pass);
+    template <class Each> void runWhole(const Each& pass, const Part& part, Result& share);
+    template <class Each> double beginStage(const Each& pass, int stage, const Part& piece);
+    template <class Each> void runCut(const Each& pass, Result& result);
+    template <class Unknowns> void eliminate(const Unknowns& unknowns, const Part& piece);
+
+    void ensureFactor(FactorScope scope);
+    void ensureGeneralFactor();
+    StepArrays arraysOf(const Trial& trial);
+    void moveParticles(const Trial& trial, const int* first, const int* end, const Part& part, bool withVelocities);
+    void moveParticles(const Trial& trial, const Part& part, bool withVelocities);
+    void moveFreeParticle(const Trial& trial, int i);
+    bool solveByNewton(const Trial& trial, const Guess& guess);
+    bool iterateNewton(const Trial& trial);
+    bool projectByChord(const ExpressionParameters& theta, Vectors& positions);
+    bool projectByNewton(const ExpressionParameters& theta, Vectors& positions);
+    std::string explain(const Vectors& from, const ExpressionParameters& theta, const Vectors& displacement,
+                        const std::string& wayOut);
+
+    ConstraintSystem system;
+    ConstraintMatrix matrix;
+    NewtonMatrix newtonMatrix;
+    SharedWork work;
+    std::vector<int> movingParticles;
+    double tolerance;
+    long long numIterations;
+    double lastError; // the largest relative error of a constraint that the last iteration left
+
+    // Where moveTo() has moved to; and there G, G M^-1 F and the factor of K, as far as the scope says. The batches do without.
+    const Vectors *q, *force;
+    const ExpressionParameters* theta;
+    FactorScope factorScope;
+    ConstraintSystem::Jacobian jacobian;
+    std::vector<double> appliedTerm;
+
+    // The step in progress.
+    ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
+    std::vector<double> appliedTermNext, residual, correction, before;
+    Vectors acceleration;
+    bool hasCorrection; // whether the next coupledPass() has one to apply
+    std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the unknowns of a piece
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_CONSTRAINTSOLVER_H_
