@@ -17,9 +17,9 @@ const double STEP = 0.002, KT_300 = 300 * 0.00831446;
 typedef vector<Vec3> Vectors;
 
 struct Example {
-    ConstraintSystem system{{4.0, 1.0}, {}};
-    AutomaticControl control{system};
-    const ExpressionParameters none = system.getGivenParameters();
+    ConstraintSolver solver{{4.0, 1.0}, {}};
+    AutomaticControl control{solver};
+    const ExpressionParameters none = solver.getSystem().getGivenParameters();
     const vector<double> noMultipliers;
     Vectors positions = {Vec3(), Vec3(1, 0, 0)}, velocities = {Vec3(0.5, 0, 0), Vec3(0, 1.5, 0)};
     Vectors forces = {Vec3(), Vec3()};
