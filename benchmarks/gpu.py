@@ -326,7 +326,11 @@ def measure(name: str, precision: str, options: argparse.Namespace) -> None:
         for label, run in runs.items():
             if label in ("LangevinMiddle", "custom") or time.perf_counter() - BEGIN > options.budget:
                 continue
-            numbers = measure_energy(run, options.duration, 50)
+            try:
+                numbers = measure_energy(run, options.duration, 50)
+            except openmm.OpenMMException as error:
+                say(f"   {label} failed: {error}")
+                continue
             write({"integrator": label, **numbers})
             say(
                 f"   energy over {numbers['time']:.2f} ps, {label:15s} scatter {numbers['energy_scatter']:.3f} kJ/mol, "

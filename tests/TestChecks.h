@@ -507,4 +507,27 @@ inline void testVelocitiesOffTheConstraints() {
     ASSERT_EQUAL_TOL(energy, state.getKineticEnergy(), 1e-9); // nothing acts on a rigid body
 }
 
+inline TestList getCheckTests() {
+    return {{"masses", testMasses},
+            {"lengths", testLengths},
+            {"constraints on virtual sites", testConstrainedSites},
+            {"thermostats and expressions", testThermostats},
+            {"barostats and expressions", testBarostats},
+            {"wrapped positions", testWrappedPositions},
+            {"a long bond in a skewed box", testLongBondInSkewedBox},
+            {"wrapped positions with few digits", testPositionsFromFiles},
+            {"starts far off", testStartsFarOff},
+            {"a ring through the box", testRingThroughTheBox},
+            {"a wrapped particle on a sphere", testWrappedParticleOnSphere},
+            {"positions", testPositions},
+            {"positions far out", testPositionsFarOut},
+            {"the smallest step", testSmallestStep},
+            {"constraints that contradict each other", testConstraintsThatContradictEachOther},
+            {"velocities that are too fast", testFastVelocities},
+            {"velocities of coupled constraints", testVelocitiesOfCoupledConstraints},
+            {"the distribution of velocities", testMaxwellVelocities},
+            {"seeds and errors of velocities", testSeedsAndErrorsOfVelocities},
+            {"velocities off the constraints", testVelocitiesOffTheConstraints}};
+}
+
 } // namespace OpenMMVRattle

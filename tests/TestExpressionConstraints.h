@@ -104,4 +104,10 @@ inline void testRunsWithExpressionsGoOn() {
                  [&] { loadCheckpoint(bareContext, checkpointOf(context)); });
 }
 
+inline TestList getExpressionTests() {
+    return {{"the tension of a spherical pendulum", testTension},
+            {"setters, getters and XML", testSettersAndGetters},
+            {"runs with expressions go on from checkpoints", testRunsWithExpressionsGoOn}};
+}
+
 } // namespace OpenMMVRattle

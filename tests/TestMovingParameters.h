@@ -249,4 +249,14 @@ inline void testStepToWhileMoving() {
     }
 }
 
+inline TestList getMovingParameterTests() {
+    return {{"cost and energy balance", testCostAndBalance},
+            {"the monitor of half steps after a jump of the force", testMonitorAfterJumpOfForce},
+            {"a force that is updated", testUpdatedForce},
+            {"runs saved in the middle", testSavedInTheMiddle},
+            {"a trial run in between", testTrialRunInBetween},
+            {"a jump that is too large", testTooLargeJump},
+            {"stepTo()", testStepToWhileMoving}};
+}
+
 } // namespace OpenMMVRattle

@@ -12,7 +12,6 @@
 #include "openmm/internal/AndersenThermostatImpl.h"
 #include "openmm/internal/ForceImpl.h"
 #include "openmm/kernels.h"
-#include "openmm/reference/ReferencePlatform.h"
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -53,12 +52,6 @@ string nameOf(const vector<ExpressionConstraint>& expressions, size_t index) {
 void requireExpressions(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
     if (expressions.empty())
         return;
-    const OpenMM::Platform& platform = context.getPlatform();
-    if (dynamic_cast<const OpenMM::ReferencePlatform*>(&platform) == nullptr)
-        throw OpenMMException(PREFIX +
-                              "constraints given as expressions work on the platforms Reference and CPU, and "
-                              "this Context is on " +
-                              platform.getName() + "; create it on one of those");
     const System& system = context.getSystem();
     for (size_t e = 0; e < expressions.size(); e++) {
         const string constraint = nameOf(expressions, e);

@@ -113,16 +113,34 @@ def test_the_python_files_alone(tmp_path):
     check_without_compiled_part(lines, "_build")
 
 
+# The libraries for the platforms that this OpenMM has.
+PRESENT = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
+NEEDED = [
+    library for library, platforms in openmmvrattle._PLATFORMS_OF_LIBRARY.items() if not PRESENT.isdisjoint(platforms)
+]
+
+
+def test_each_gpu_platform_has_a_library():
+    """In the package whether or not this OpenMM has the platform; it is loaded only where it has."""
+    folder = Path(openmmvrattle._vrattle.__file__).parent / "lib" / "plugins"
+    for name in ("OpenCL", "CUDA", "HIP"):
+        assert list(folder.glob(f"libOpenMMVRattle{name}.so"))
+        assert openmmvrattle._PLATFORMS_OF_LIBRARY[f"OpenMMVRattle{name}"] == (name,)
+
+
 def test_a_missing_library_is_reported(tmp_path):
-    (failure,) = openmmvrattle._load_plugins(tmp_path)
-    assert "OpenMMVRattleReference" in failure
+    failures = openmmvrattle._load_plugins(tmp_path)
+    assert len(failures) == len(NEEDED)
+    for library, failure in zip(NEEDED, failures, strict=True):
+        assert library in failure
 
 
 def test_a_broken_library_is_reported(tmp_path):
     broken = tmp_path / "libOpenMMVRattleReference.so"
     broken.write_text("no library at all")
-    (failure,) = openmmvrattle._load_plugins(tmp_path)
+    failure, *others = openmmvrattle._load_plugins(tmp_path)
     assert str(broken) in failure
+    assert len(others) == len(NEEDED) - 1
 
 
 def test_a_library_for_a_missing_platform_is_left_alone(tmp_path, monkeypatch):

@@ -2,14 +2,12 @@
 // SPDX-License-Identifier: MIT
 
 #include "ClusterKinds.h"
-#include "openmm/OpenMMException.h"
 #include <algorithm>
 #include <map>
 #include <numeric>
 #include <string>
 
 using namespace OpenMMVRattle;
-using OpenMM::OpenMMException;
 using std::pair;
 using std::vector;
 
@@ -53,22 +51,16 @@ vector<ClusterKind> ClusterKinds::find(const OpenMM::System& system) {
         clusters[findRoot(parents, bond.particle1)].second.push_back(bond);
 
     std::map<pair<int, vector<pair<int, int>>>, ClusterKind> found;
+    vector<int> places(numParticles); // in its cluster
     for (auto& entry : clusters) {
         vector<int>& atoms = entry.second.first;
-        if ((int) entry.second.second.size() > MAX_CONSTRAINTS)
-            throw OpenMMException("VariableStepRattleIntegrator: particle " + std::to_string(atoms[0]) +
-                                  " is in a cluster of " + std::to_string(entry.second.second.size()) +
-                                  " coupled constraints, and clusters of more than " + std::to_string(MAX_CONSTRAINTS) +
-                                  " do not run on this platform yet; use the platform CPU or Reference, or constrain "
-                                  "bonds of hydrogen only");
         // Particles with more bonds first, so that equal molecules written in another order are mostly of one kind.
         std::stable_sort(atoms.begin(), atoms.end(), [&](int a, int b) { return degrees[a] > degrees[b]; });
-        auto placeOf = [&](int particle) {
-            return (int) (std::find(atoms.begin(), atoms.end(), particle) - atoms.begin());
-        };
+        for (size_t i = 0; i < atoms.size(); i++)
+            places[atoms[i]] = (int) i;
         vector<std::tuple<int, int, int, double>> sorted;
         for (const Bond& bond : entry.second.second) {
-            const int a = placeOf(bond.particle1), b = placeOf(bond.particle2);
+            const int a = places[bond.particle1], b = places[bond.particle2];
             sorted.emplace_back(std::min(a, b), std::max(a, b), bond.constraint, bond.length);
         }
         std::sort(sorted.begin(), sorted.end());
@@ -93,4 +85,9 @@ vector<ClusterKind> ClusterKinds::find(const OpenMM::System& system) {
     std::stable_sort(kinds.begin(), kinds.end(),
                      [](const ClusterKind& a, const ClusterKind& b) { return a.pairs.size() > b.pairs.size(); });
     return kinds;
+}
+
+bool ClusterKinds::areAllSmall(const vector<ClusterKind>& kinds) {
+    return std::all_of(kinds.begin(), kinds.end(),
+                       [](const ClusterKind& kind) { return kind.pairs.size() <= MAX_CONSTRAINTS; });
 }

@@ -22,14 +22,13 @@ struct ClusterKind {
     std::vector<std::vector<int>> constraints;      // of each cluster, by indices of the System
 };
 
-/**
- * Sort the particles of a System that have mass into kinds; those with most constraints come first. Throws an OpenMMException if a
- * cluster has more than MAX_CONSTRAINTS constraints.
- */
 class ClusterKinds {
 public:
     static const int MAX_CONSTRAINTS = 8;
+    /** Sort the particles of a System that have mass into kinds; those with most constraints come first. */
     static std::vector<ClusterKind> find(const OpenMM::System& system);
+    /** Whether no cluster has more than MAX_CONSTRAINTS constraints. */
+    static bool areAllSmall(const std::vector<ClusterKind>& kinds);
 };
 
 } // namespace OpenMMVRattle

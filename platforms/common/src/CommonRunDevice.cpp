@@ -42,11 +42,13 @@ private:
 CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                  const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         HostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
-        steps(compute, context.getSystem()), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
-        areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
-        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
-        writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
+        state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true), areSettingsOnDevice(false),
+        hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK), lastMaxTime(NO_LIMIT), settledTime(0),
+        settledCount(0), knownCount(0), groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true),
+        numDeviceRescues(0) {
     compute.initializeContexts();
+    if (DeviceSteps::canTake(context.getSystem(), settings.expressions))
+        steps = std::make_unique<DeviceSteps>(compute, context.getSystem());
     ContextSelector selector(compute);
     compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context
 }
@@ -81,7 +83,7 @@ void CommonRunDevice::ensureForces() {
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
 bool CommonRunDevice::canStepOnDevice() {
-    if (settings.isAutomatic || ahead != nullptr || !dynamics->hasStarted())
+    if (steps == nullptr || settings.isAutomatic || ahead != nullptr || !dynamics->hasStarted())
         return false;
     const vector<double> references = dynamics->getReferences();
     return std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
@@ -95,12 +97,12 @@ void CommonRunDevice::beginOnDevice() {
         const vector<double> references = dynamics->getReferences();
         for (size_t k = 0; k < terms.size(); k++)
             terms[k].reference = references[k];
-        steps.setSettings({settings.stepSize,
-                           StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
-                           settings.update, settings.isFixedStep, settings.tolerance, terms});
+        steps->setSettings({settings.stepSize,
+                            StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
+                            settings.update, settings.isFixedStep, settings.tolerance, terms});
         areSettingsOnDevice = true;
     }
-    hasBegun = steps.begin(state, groupEnergy);
+    hasBegun = steps->begin(state, groupEnergy);
     hasReport = false;
 }
 
@@ -154,26 +156,26 @@ void CommonRunDevice::stepOnDevice(double maxTime) {
     ensureForces();
     isOnHost = hasReport = false;
     lastMaxTime = maxTime;
-    steps.advance(maxTime - vectors->getTime());
+    steps->advance(maxTime - vectors->getTime());
     numAsked++;
     try {
         context.computeVirtualSites();
         if (reach.isUnknown)
-            vectors->setTime(settledTime + steps.readElapsed());
+            vectors->setTime(settledTime + steps->readElapsed());
         vectors->setStepCount(settledCount + numAsked);
         // A state that is to be put back must not have been put into another order.
-        if (compute.getStepsSinceReorder() < STEPS_BETWEEN_REORDERINGS || !steps.hasFailed()) {
+        if (compute.getStepsSinceReorder() < STEPS_BETWEEN_REORDERINGS || !steps->hasFailed()) {
             ContextSelector selector(compute);
             compute.reorderAtoms();
         }
         computeForces();
     }
     catch (...) {
-        accept(steps.putBack());
+        accept(steps->putBack());
         context.computeVirtualSites();
         throw;
     }
-    steps.finish(groupEnergy);
+    steps->finish(groupEnergy);
     if (numAsked >= stepsUntilLook)
         settle();
 }
@@ -199,7 +201,7 @@ void CommonRunDevice::accept(const DeviceSteps::Report& report) {
 void CommonRunDevice::settle() {
     while (numAsked > 0) {
         const int asked = numAsked;
-        const DeviceSteps::Report report = steps.read();
+        const DeviceSteps::Report report = steps->read();
         accept(report);
         // What follows a step that has failed is done in vain, so where steps fail often the device is looked at often.
         stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MAX_STEPS_UNTIL_LOOK);
@@ -260,7 +262,7 @@ RunDevice::Change CommonRunDevice::findChange() {
     std::copy(box, box + 3, boxVectors);
     if (isOtherBox)
         return Change::Box;
-    // Another integrator (of a CompoundIntegrator) has taken steps.
+    // Another integrator (of a CompoundIntegrator) has taken steps->
     if (vectors->getStepCount() != knownCount)
         return Change::State;
     // A uniform motion is of no concern to constraints and their forces.
@@ -291,7 +293,7 @@ void CommonRunDevice::changeState() {
         return;
     }
     computeForces();
-    hasBegun = steps.change(groupEnergy);
+    hasBegun = steps->change(groupEnergy);
     knownCount = vectors->getStepCount();
     readState();
 }
@@ -305,7 +307,7 @@ void CommonRunDevice::changeForces() {
         return;
     }
     computeForces();
-    hasBegun = steps.change(groupEnergy);
+    hasBegun = steps->change(groupEnergy);
     knownCount = vectors->getStepCount();
     readState();
 }
@@ -318,7 +320,7 @@ void CommonRunDevice::changeVelocities() {
         return;
     }
     ensureForces();
-    hasBegun = steps.change(groupEnergy);
+    hasBegun = steps->change(groupEnergy);
     readState();
 }
 
@@ -328,7 +330,7 @@ void CommonRunDevice::readState() {
     hasReport = hasBegun;
     if (!hasBegun)
         return;
-    lastReport = steps.read();
+    lastReport = steps->read();
     state = lastReport.state;
 }
 
@@ -364,7 +366,7 @@ vector<double> CommonRunDevice::getMonitorValues() {
     settle();
     if (isOnDevice && hasBegun) {
         if (!hasReport) {
-            lastReport = steps.read();
+            lastReport = steps->read();
             hasReport = true;
         }
         return lastReport.values;
@@ -386,7 +388,7 @@ double CommonRunDevice::computeKineticEnergy() {
 
 long long CommonRunDevice::getNumSolverIterations() {
     settle();
-    return HostRunDevice::getNumSolverIterations() + steps.getNumIterations();
+    return HostRunDevice::getNumSolverIterations() + (steps == nullptr ? 0 : steps->getNumIterations());
 }
 
 long long CommonRunDevice::getNumRescues() {

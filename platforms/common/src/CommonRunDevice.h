@@ -13,7 +13,8 @@ namespace OpenMMVRattle {
 /**
  * The device for OpenCL, CUDA and HIP. The steps in the middle of a run are taken by the GPU (DeviceSteps), which nobody waits for
  * until the run settles. What is rare is done on the host with forces from the GPU: the start, the first step, a step that the GPU
- * could not complete, trial runs, turning around, saving. The two hand the state over to each other.
+ * could not complete, trial runs, turning around, saving. The two hand the state over to each other. What the GPU cannot do is
+ * done on the host throughout: automatic step control, and constraints for which there are no kernels.
  */
 class CommonRunDevice : public HostRunDevice {
 public:
@@ -61,7 +62,7 @@ private:
     void bringToHost();
     void takeToHost();
     OpenMM::ComputeContext& compute;
-    DeviceSteps steps;
+    std::unique_ptr<DeviceSteps> steps; // none where the host takes them all
     DeviceSteps::State state; // of the device when it was read last
     DeviceSteps::Report lastReport;
     bool isOnDevice;    // the state is that of the device, and goes on there

@@ -33,6 +33,10 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& 
         elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
 }
 
+bool DeviceSteps::canTake(const OpenMM::System& system, const vector<ExpressionConstraint>& expressions) {
+    return expressions.empty() && ClusterKinds::areAllSmall(ClusterKinds::find(system));
+}
+
 double DeviceSteps::tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance) {
     const double least = context.getUseDoublePrecision()  ? DOUBLE_TOLERANCE
                          : context.getUseMixedPrecision() ? MIXED_TOLERANCE

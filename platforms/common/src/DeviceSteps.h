@@ -6,6 +6,7 @@
 
 #include "ClusterKinds.h"
 #include "StepProgram.h"
+#include "expressions/ExpressionGroup.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
 #include <map>
@@ -48,7 +49,8 @@ public:
         bool hasFailed;
     };
 
-    /** @throws OpenMMException    if a cluster of constraints is too large */
+    /** Whether all constraints are of those that the device can solve. */
+    static bool canTake(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
     DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system);
     /** Take over settings, after which begin() is due. */
     void setSettings(const Settings& settings);
