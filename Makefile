@@ -22,7 +22,7 @@ PYTHON_REPORT ?= $(abspath $(BUILD))/python-tests.xml
 comma := ,
 CXX_FILES = $(shell find openmmapi method platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize sanitize-threads scaling python-test claims docs pictures wheel sdist conda install format clean
+.PHONY: all demo test check-format cxx-test sanitize sanitize-threads scaling python-test claims docs proof pictures wheel sdist conda install format clean
 
 all: test
 
@@ -88,7 +88,13 @@ docs: install $(DOCS_TOOLS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html."
 
-# The first picture of the README, drawn anew.
+# A protein in water at constant energy beside VerletIntegrator: the table and the figure of docs/proof.md. PROOF_ARGUMENTS, for example
+# "--platform CUDA --time 100", and then it is put beside.
+PROOF_ARGUMENTS ?=
+proof: install
+	$(BIN)/python benchmarks/proof.py --page $(PROOF_ARGUMENTS)
+
+# The picture of the double pendulum in the README, drawn anew.
 pictures: install
 	$(BIN)/python docs/draw_pictures.py
 

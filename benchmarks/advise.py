@@ -35,6 +35,7 @@ from pathlib import Path
 import automatic_unseen
 import numpy as np
 import openmm
+import pages
 from openmm import app
 from openmmvrattle.compare.advice import Advice, AdviceError, Candidate, advise_on, measured_gain
 from openmmvrattle.compare.comparison import two_digits
@@ -98,7 +99,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--unseen", action="store_true", help="the ten systems that the limits were not set on")
     parser.add_argument("--best-only", action="store_true", help="do not run the other candidates")
     parser.add_argument("--output", type=Path, default=Path("out/advise"), metavar="FOLDER")
+    parser.add_argument("--page", action="store_true", help="put tables and figures into docs/advice.md")
     options = parser.parse_args(arguments)
+    if options.page and options.systems != list(SYSTEMS):
+        parser.error("a page shows a run of everything")
     options.output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     rows: list[Row] = []
@@ -119,6 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (options.output / "advise.md").write_text(report + "\n", encoding="utf-8")
     if not options.best_only:
         _draw(rows, options.output / "advise.png")
+    if options.page:
+        place = "unseen" if options.unseen else "verdicts"
+        pages.write(pages.DOCS / "advice.md", place, [pages.provenance(), "", *_verdicts(rows)])
     print(report)
     seconds = time.perf_counter() - started
     print(f"\n{seconds:.0f} s, OpenMM {openmm.Platform.getOpenMMVersion()}, {platform.machine()}.")

@@ -23,6 +23,7 @@ import argparse
 import functools
 import json
 import math
+import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -32,6 +33,7 @@ from pathlib import Path
 
 import numpy as np
 import openmm
+import pages
 from matplotlib.figure import Figure
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator
@@ -377,7 +379,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--quick", action="store_true", help="one start and a twentieth of the time; proves nothing")
     parser.add_argument("--output", type=Path, default=Path("out/automatic"), metavar="FOLDER")
+    parser.add_argument("--page", action="store_true", help="put tables and figures into docs/automatic_benchmark.md")
     options = parser.parse_args(arguments)
+    if options.page and (options.quick or options.longer != 1.0 or options.systems != list(PROBLEMS)):
+        parser.error("a page shows a run of everything")
     options.output.mkdir(parents=True, exist_ok=True)
     seeds = range(1, 2 if options.quick else options.starts + 1)
     part = 0.05 if options.quick else options.longer
@@ -396,6 +401,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     draw_gains(results).savefig(options.output / "gains.png")
     draw_monitors().savefig(options.output / "monitors.png")
     print("\n".join(table(results)))
+    if options.page:
+        for name in ("gains", "monitors"):
+            shutil.copy(options.output / f"{name}.png", pages.DOCS / "images" / f"automatic-{name}.png")
+        pages.write(pages.DOCS / "automatic_benchmark.md", "gains", [pages.provenance(), "", *table(results)])
     print(f"{len(results) * len(seeds) * options.copies} comparisons in {time.perf_counter() - began:.0f} s")
     wrong = faults(results)
     for fault in wrong:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import openmm
+import pages
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters, water_clash
 
@@ -452,7 +453,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--systems", nargs="+", choices=names, default=names, metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="a twentieth of the time; proves nothing")
     parser.add_argument("--output", type=Path, default=Path("out/automatic_unseen"), metavar="FOLDER")
+    parser.add_argument("--page", action="store_true", help="put tables and figures into docs/automatic_benchmark.md")
     options = parser.parse_args(arguments)
+    if options.page and (options.quick or options.systems != names):
+        parser.error("a page shows a run of everything")
     options.output.mkdir(parents=True, exist_ok=True)
     results = []
     for name in options.systems:
@@ -460,6 +464,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(asdict(results[-1])), flush=True)
     (options.output / "automatic_unseen.jsonl").write_text("".join(json.dumps(asdict(r)) + "\n" for r in results))
     print("\n".join(table(results)))
+    if options.page:
+        for place, some in (("unseen", SYSTEMS), ("seen", SEEN)):
+            lines = [pages.provenance(), "", *table([result for result in results if result.system in some])]
+            pages.write(pages.DOCS / "automatic_benchmark.md", place, lines)
     return 1 if any(r.automatic.failure for r in results) else 0
 
 

@@ -38,6 +38,7 @@ from typing import Any
 
 import numpy as np
 import openmm
+import pages
 from openmmvrattle.compare.comparison import compare, quick_settings, two_digits
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, StepControl, TestSystem
 from PIL import Image
@@ -295,6 +296,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (options.output / "table.md").write_text(report + "\n", encoding="utf-8")
     if any(m.study == "monitors" for m in measurements):
         _draw(measurements, options.output / "work_precision.png")
+    if options.page:
+        _draw(measurements, pages.DOCS / "images" / "work_precision.png")
+        pages.write(pages.DOCS / "work_precision.md", "work-precision", [pages.provenance(), "", report])
     print(report)
     print()
     for line in _judge(measurements, options):
@@ -328,7 +332,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--quick", action="store_true", help="run a short part only; gains and claims are not those of the full runs"
     )
     parser.add_argument("--output", type=Path, default=Path("out/work-precision"), metavar="FOLDER")
+    parser.add_argument("--page", action="store_true", help="put tables and figures into docs/work_precision.md")
     options = parser.parse_args(arguments)
+    if options.page and (options.quick or options.claims is not None or options.evaluations):
+        parser.error("a page shows a run of everything")
     if options.jobs < 1:
         parser.error("the number of jobs must be at least 1")
     if options.evaluations and min(options.evaluations) < 100:

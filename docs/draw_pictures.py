@@ -1,6 +1,6 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""Draw the first picture of the README anew: `make pictures`, about ten seconds.
+"""Draw the picture of the README anew: `make pictures`, about ten seconds.
 
 It is the picture of `python -m openmmvrattle compare --system double-pendulum`, with a headline and words for readers
 who have seen none of it before. The other pictures of the documentation are made by the scripts that their pages name.

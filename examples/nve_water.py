@@ -5,6 +5,8 @@
 python examples/nve_water.py
 """
 
+import csv
+
 import openmm
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
@@ -12,10 +14,7 @@ from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import rigid_waters
 
 water = rigid_waters(32)  # a droplet of 32 rigid TIP3P molecules at 300 K
-integrator = VariableStepRattleIntegrator(1 * unit.femtosecond)
-integrator.clearMonitors()
-integrator.addMonitor(VariableStepRattleIntegrator.ConstraintAndAppliedForce)
-
+integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # ps
 simulation = app.Simulation(water.topology, water.system, integrator, openmm.Platform.getPlatformByName("CPU"))
 simulation.context.setPositions(water.positions)
 simulation.context.setVelocities(water.velocities)
@@ -30,6 +29,7 @@ simulation.reporters += [
 run_for_time(simulation, 2 * unit.picosecond, every=0.1 * unit.picosecond)
 
 print("time (ps)  step density  energy error (kJ/mol)  constraint error")
-for line in open("nve_water_steps.csv").read().splitlines()[1:]:
-    _, time, _, density, _, error, _, _, _, constraints = map(float, line.split(","))
+for row in csv.DictReader(open("nve_water_steps.csv", newline="")):
+    time, density = float(row["Time (ps)"]), float(row["Step Density"])
+    error, constraints = float(row["Energy Error (kJ/mole)"]), float(row["Constraint Error"])
     print(f"{time:9.2f}  {density:12.3f}  {error:21.4f}  {constraints:16.1e}")

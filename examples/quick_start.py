@@ -7,15 +7,16 @@ from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import double_pendulum
 
 pendulum = double_pendulum()
-integrator = VariableStepRattleIntegrator(0.01)  # ps, the size of the first step
-integrator.setMinimumStepSize(1e-6)
-integrator.setMaximumStepSize(0.02)
+integrator = VariableStepRattleIntegrator(0.0005, automatic=True)  # ps, the size of steps while nothing unusual happens
 context = openmm.Context(pendulum.system, integrator, openmm.Platform.getPlatformByName("Reference"))
 context.setPositions(pendulum.positions)
 context.setVelocities(pendulum.velocities)
 for _ in range(20):
-    integrator.step(1000)
+    steps = []
+    for _ in range(1000):
+        integrator.step(1)
+        steps.append(integrator.getStepSize()._value)
     state = context.getState(energy=True)
-    time, step = state.getTime()._value, integrator.getStepSize()._value
+    time, step = state.getTime()._value, min(steps)
     energy = (state.getKineticEnergy() + state.getPotentialEnergy())._value
-    print(f"time {time:.4f} ps   step {step:.1e} ps   energy {energy:.4f} kJ/mol")
+    print(f"time {time:.4f} ps   smallest step {step:.1e} ps   energy {energy:.4f} kJ/mol")

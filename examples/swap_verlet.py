@@ -14,9 +14,8 @@ from openmmvrattle.testsystems import alanine_dipeptide
 molecule = alanine_dipeptide()
 topology, system, positions = molecule.topology, molecule.system, molecule.positions
 
-# was: integrator = openmm.VerletIntegrator(1 * unit.femtosecond)
-integrator = VariableStepRattleIntegrator(1 * unit.femtosecond)
-integrator.useAutomaticStepControl()  # new: 1 fs while nothing unusual happens, shorter steps when something does
+# was: integrator = openmm.VerletIntegrator(0.001)
+integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # new: shorter steps when something unusual happens
 
 simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("CPU"))
 simulation.context.setPositions(positions)

@@ -11,7 +11,7 @@
 namespace OpenMMVRattle {
 
 /**
- * Automatic step control: the density rho from two monitors that need no choice (docs/automatic.md has the reasons).
+ * Automatic step control: the density rho from two monitors that need no choice (docs/automatic_method.md has the reasons).
  *
  * A cluster c is a set of particles joined by constraints; a free particle is one of its own. With the applied force F, the net
  * force N = F - G^T Lambda, and what would turn the flight of a particle on the length l_f,

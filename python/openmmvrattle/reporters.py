@@ -47,7 +47,7 @@ class StepSizeReporter:
     The columns are, as far as the integrator has them: step, time, size and density of the last step, the value of each
     monitor, energy minus the energy at the start, iterations of the constraint solver per step since the last report,
     rescues and force evaluations so far, and the largest relative error of a constraint, in the sense of
-    setConstraintTolerance(). With automatic step control the monitors are U_A and U_B of docs/automatic.md. An
+    setConstraintTolerance(). With automatic step control the monitors are U_A and U_B of docs/automatic_method.md. An
     integrator of OpenMM has the step size alone of what is about steps, so the two can be compared.
 
     A report does not disturb the run, and costs no force evaluation of the integrator. For its energy it asks OpenMM

@@ -67,7 +67,7 @@ def densities_of(integrator: VariableStepRattleIntegrator, steps: int) -> Array:
 
 
 class Statement:
-    """The monitors and the update of docs/automatic.md with dense matrices."""
+    """The monitors and the update of docs/automatic_method.md with dense matrices."""
 
     def __init__(self, model: Model) -> None:
         self.c = model.constraints()

@@ -157,20 +157,27 @@ def test_every_example_is_listed() -> None:
     assert not [path.name for path in examples if f"](../{path.relative_to(ROOT).as_posix()})" not in page]
 
 
+@pytest.mark.parametrize("name", ["README", "docs/openmm", "docs/automatic", "docs/restart", "docs/migration"])
+def test_the_recipe_is_the_same_everywhere(name: str) -> None:
+    recipe = "integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # was: openmm.VerletIntegrator(0.001); "
+    (_, first), *_ = fences(ROOT / f"{name}.md", "python")
+    assert recipe in first
+
+
 @pytest.mark.parametrize("picture", sorted(ROOT.glob("docs/images/*.png")), ids=name_of)
 def test_a_picture_is_small_and_shown(picture: Path) -> None:
     assert picture.stat().st_size < 200_000
     assert any(f"images/{picture.name})" in page.read_text(encoding="utf-8") for page in PAGES)
 
 
-def test_the_first_picture_says_what_the_readme_says(tmp_path: Path) -> None:
+def test_the_first_picture_says_what_the_table_says(tmp_path: Path) -> None:
     """It is drawn anew; the motion is chaotic after the first whip, so last digits may differ."""
     script = runpy.run_path(str(ROOT / "docs" / "draw_pictures.py"))
     figure = script["draw"](script["run_comparison"]())
     figure.savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    row = re.search(r"^\| `double-pendulum`: .*", readme, re.MULTILINE)[0]
+    page = (ROOT / "docs" / "where_it_pays.md").read_text(encoding="utf-8")
+    row = re.search(r"^\| `double-pendulum`: .*", page, re.MULTILINE)[0]
     numbers = [float(re.search(r"[\d.,]+", cell)[0].replace(",", "")) for cell in row.split("|")[2:-1]]
     evaluations, verlet, _, _, variable, fixed, own, gain = numbers  # those left out are of automatic step control
     errors = [verlet, variable, fixed, own]

@@ -1,0 +1,53 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""The proof on a solvated molecule, in small: both integrators, a restart in the middle, and what is written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from project_scripts import ROOT, load_script
+
+pytestmark = pytest.mark.skipif(not (ROOT / "benchmarks").exists(), reason="needs the folder benchmarks")
+
+
+@pytest.fixture(scope="module")
+def proof() -> ModuleType:
+    pytest.importorskip("matplotlib")
+    return load_script("benchmarks/proof.py")
+
+
+def test_a_short_run(proof: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proof, "TURN", 4)
+    monkeypatch.setattr(proof.pages, "DOCS", tmp_path)
+    (tmp_path / "images").mkdir()
+    page = tmp_path / "proof.md"
+    page.write_text("<!-- measured: proof -->\n<!-- end: proof -->\n")
+    arguments = ["--system", "alanine-dipeptide", "--time", "0.32", "--relaxation", "0.02", "--output", str(tmp_path)]
+    assert proof.main([*arguments, "--page"]) == 0
+    verlet, automatic = json.loads((tmp_path / "proof.json").read_text())
+    assert (verlet["integrator"], automatic["integrator"]) == ("VerletIntegrator", "automatic")
+    assert verlet["steps"] == automatic["steps"] == 160
+    assert verlet["cost"] == 1.0
+    assert automatic["constraint_error"] <= 1e-8 < 1e-4
+    assert verlet["constraint_error"] < 2e-6
+    for run in (verlet, automatic):
+        assert run["simulated_ps"] == pytest.approx(0.322, rel=0.02)
+        # Positions and velocities are the same to the last bit; 20,000 kJ/mol in single precision are added up anew.
+        assert abs(run["energy_change_at_restart"]) < 0.5
+        assert 0 < run["fluctuation"] < 5
+    rows = list(csv.DictReader((tmp_path / "proof.csv").open()))
+    assert len(rows) == 2 * 41
+    text = page.read_text()
+    assert "drift of the total energy" in text and "![Total energy of both runs](images/proof.png)" in text
+    assert (tmp_path / "images" / "proof.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_that_is_too_short_is_refused(proof: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        proof.main(["--time", "0.1"])
+    assert "a drift needs at least 1000 steps" in capsys.readouterr().err
