@@ -26,6 +26,7 @@
 #include "openmm/RPMDIntegrator.h"
 #include "openmm/RPMDMonteCarloBarostat.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
 
 namespace {
 
@@ -61,7 +62,7 @@ struct ConstraintParts {
     std::map<std::string, double> parameters;
 };
 
-ConstraintParts getConstraintParts(const OpenMMVRattle::VariableStepRattleIntegrator* integrator, int index) {
+ConstraintParts getConstraintParts(const OpenMMVRattle::ConstrainedIntegrator* integrator, int index) {
     ConstraintParts parts;
     integrator->getExpressionConstraintParameters(index, parts.expression, parts.particles, parts.parameters);
     return parts;
@@ -81,8 +82,8 @@ ConstraintParts getConstraintParts(const OpenMMVRattle::VariableStepRattleIntegr
 }
 
 // For methods that may compute forces, which can take long or call Python code.
-%define RELEASES_GIL(method)
-%exception OpenMMVRattle::VariableStepRattleIntegrator::method {
+%define RELEASES_GIL(class, method)
+%exception OpenMMVRattle::class::method {
     try {
         ReleasedGIL released;
         $action
@@ -93,14 +94,15 @@ ConstraintParts getConstraintParts(const OpenMMVRattle::VariableStepRattleIntegr
     }
 }
 %enddef
-RELEASES_GIL(calibrate)
-RELEASES_GIL(getExpressionConstraintMultiplier)
-RELEASES_GIL(getMonitorValue)
-RELEASES_GIL(getMultipliers)
-RELEASES_GIL(reverse)
-RELEASES_GIL(setVelocitiesToTemperature)
-RELEASES_GIL(step)
-RELEASES_GIL(stepTo)
+RELEASES_GIL(ConstrainedIntegrator, getExpressionConstraintMultiplier)
+RELEASES_GIL(ConstrainedIntegrator, getMultipliers)
+RELEASES_GIL(ConstrainedIntegrator, setVelocitiesToTemperature)
+RELEASES_GIL(ConstrainedIntegrator, step)
+RELEASES_GIL(VariableStepRattleIntegrator, calibrate)
+RELEASES_GIL(VariableStepRattleIntegrator, getMonitorValue)
+RELEASES_GIL(VariableStepRattleIntegrator, reverse)
+RELEASES_GIL(VariableStepRattleIntegrator, stepTo)
+RELEASES_GIL(VariableStepRattleLangevinIntegrator, getMonitorValue)
 
 // Default arguments would turn into *args; the defaults stand in integrators.py.
 %feature("compactdefaultargs");
@@ -111,22 +113,21 @@ RELEASES_GIL(stepTo)
 %apply double& OUTPUT { double& weight, double& power };
 
 // Those of OpenMM's own class, which in Python take a set as well, call ours.
-%ignore OpenMMVRattle::VariableStepRattleIntegrator::getIntegrationForceGroups;
-%ignore OpenMMVRattle::VariableStepRattleIntegrator::setIntegrationForceGroups;
+%ignore OpenMMVRattle::ConstrainedIntegrator::getIntegrationForceGroups;
+%ignore OpenMMVRattle::ConstrainedIntegrator::setIntegrationForceGroups;
+%ignore OpenMMVRattle::ConstrainedIntegrator::getExpressionConstraintParameters;
 // Copies are made in Python.
 %ignore OpenMMVRattle::VariableStepRattleIntegrator::VariableStepRattleIntegrator(const VariableStepRattleIntegrator&);
-%ignore OpenMMVRattle::VariableStepRattleIntegrator::getExpressionConstraintParameters;
+%ignore OpenMMVRattle::VariableStepRattleLangevinIntegrator::VariableStepRattleLangevinIntegrator(
+    const VariableStepRattleLangevinIntegrator&);
 
 #define OPENMMVRATTLE_EXPORT
+%nodefaultctor OpenMMVRattle::ConstrainedIntegrator;
+%include "openmmvrattle/ConstrainedIntegrator.h"
 %include "openmmvrattle/VariableStepRattleIntegrator.h"
+%include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
 
-%extend OpenMMVRattle::VariableStepRattleIntegrator {
-    static bool _isinstance(const OpenMM::Integrator* integrator) {
-        return dynamic_cast<const OpenMMVRattle::VariableStepRattleIntegrator*>(integrator) != NULL;
-    }
-    static OpenMMVRattle::VariableStepRattleIntegrator* _cast(OpenMM::Integrator* integrator) {
-        return dynamic_cast<OpenMMVRattle::VariableStepRattleIntegrator*>(integrator);
-    }
+%extend OpenMMVRattle::ConstrainedIntegrator {
     std::string _getExpression(int index) const {
         return getConstraintParts($self, index).expression;
     }
@@ -137,3 +138,17 @@ RELEASES_GIL(stepTo)
         return getConstraintParts($self, index).parameters;
     }
 }
+
+// To find out what OpenMM has returned as a bare Integrator.
+%define CASTS(class)
+%extend OpenMMVRattle::class {
+    static bool _isinstance(const OpenMM::Integrator* integrator) {
+        return dynamic_cast<const OpenMMVRattle::class*>(integrator) != NULL;
+    }
+    static OpenMMVRattle::class* _cast(OpenMM::Integrator* integrator) {
+        return dynamic_cast<OpenMMVRattle::class*>(integrator);
+    }
+}
+%enddef
+CASTS(VariableStepRattleIntegrator)
+CASTS(VariableStepRattleLangevinIntegrator)

@@ -368,12 +368,12 @@ inline void testRefusedCheckpoints() {
     ASSERT(start != std::string::npos);
     std::string newer = checkpoint, damaged = checkpoint;
     newer[start + 8] = 9;
-    assertThrows("version 9 of its format and this plugin reads version 3",
+    assertThrows("version 9 of its format and this plugin reads version 4",
                  [&] { loadCheckpoint(run.context, newer); });
     damaged[damaged.size() - 100] ^= 1;
     assertThrows("damaged", [&] { loadCheckpoint(run.context, damaged); });
     for (size_t length = start + 1; length < checkpoint.size(); length++)
-        assertThrows("VariableStepRattleIntegrator: this checkpoint",
+        assertThrows("OpenMM-VRATTLE: this checkpoint",
                      [&] { loadCheckpoint(run.context, checkpoint.substr(0, length)); });
     std::string endless = checkpoint;
     endless[start + 12 + 6] = 1; // the length

@@ -187,6 +187,13 @@ public:
     void finish(const OnStep& state, Observer* observer = nullptr);
     /** After finish(): the vectors of moveTo() hold now what its positions, parameters and forces were. */
     void moveToEnd();
+    /** The same where they are in other vectors now, which must live on as those of moveTo(). */
+    void moveToEnd(const Vectors& newQ, const ExpressionParameters& newTheta, const Vectors& newForce) {
+        q = &newQ;
+        theta = &newTheta;
+        force = &newForce;
+        moveToEnd();
+    }
 
     // ----------------------------------------------------------------------------------------------------- anywhere
 

@@ -16,7 +16,8 @@ using std::string;
 namespace {
 
 const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
-const int VERSION = 3; // 2: fingerprints of box and parameters, no force groups; 3: parameters of expressions
+// 2: fingerprints of box and parameters, no force groups; 3: parameters of expressions; 4: random numbers
+const int VERSION = 4;
 const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
 
 unsigned long long fingerprintOf(const string& data) {
@@ -54,9 +55,9 @@ bool CheckpointBlock::read(std::istream& stream, string& data) {
     }
     int version = 0;
     if (readValue(stream, version) && version != VERSION)
-        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is written in version " +
-                              std::to_string(version) + " of its format and this plugin reads version " +
-                              std::to_string(VERSION) + "; use the version of the plugin that wrote it");
+        throw OpenMMException("OpenMM-VRATTLE: this checkpoint is written in version " + std::to_string(version) +
+                              " of its format and this plugin reads version " + std::to_string(VERSION) +
+                              "; use the version of the plugin that wrote it");
     long long numBytes = 0;
     unsigned long long fingerprint = 0;
     data.clear();
@@ -69,6 +70,6 @@ bool CheckpointBlock::read(std::istream& stream, string& data) {
         }
     }
     if (!stream || (long long) data.size() != numBytes || fingerprintOf(data) != fingerprint)
-        throw OpenMMException("VariableStepRattleIntegrator: this checkpoint is damaged or cut short");
+        throw OpenMMException("OpenMM-VRATTLE: this checkpoint is damaged or cut short");
     return true;
 }

@@ -20,11 +20,11 @@ const int MAX_HALVINGS = 8;
 
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
-[[noreturn]] void throwFailure(const std::string& what, double time, const std::string& reason,
-                               const std::string& wayOut) {
+[[noreturn]] void throwFailure(const IntegratorSettings& settings, const std::string& what, double time,
+                               const std::string& reason, const std::string& wayOut) {
     std::stringstream message;
     message.precision(10);
-    message << "VariableStepRattleIntegrator: " << what << " at t = " << time << " ps failed because " << reason
+    message << settings.getIntegratorName() << ": " << what << " at t = " << time << " ps failed because " << reason
             << wayOut;
     throw OpenMMException(message.str());
 }
@@ -81,11 +81,15 @@ void IntegratorRun::forcesChanged() {
     areForcesChanged = areForcesChanged || saved == nullptr;
 }
 
+std::string IntegratorRun::getName() const {
+    return settings.getIntegratorName();
+}
+
 void IntegratorRun::requireStepSize() const {
     if (settings.stepSize == 0)
         throw OpenMMException(
-            "VariableStepRattleIntegrator: the step size is 0, with which a Context computes energies "
-            "and takes no steps; set one with setStepSize()");
+            getName() + ": the step size is 0, with which a Context computes energies and takes no steps; set one with "
+                        "setStepSize()");
 }
 
 bool IntegratorRun::areConstraintsOthers() const {
@@ -101,13 +105,14 @@ void IntegratorRun::takeSettings() {
         return;
     settings.requireConsistent();
     if (areConstraintsOthers())
-        throw OpenMMException("VariableStepRattleIntegrator: constraints have been added or replaced since the Context "
+        throw OpenMMException(getName() +
+                              ": constraints have been added or replaced since the Context "
                               "was created; call reinitialize(preserveState=True) of the Context to use them");
     try {
         device.setSettings(settings);
     }
     catch (const StepFailure& failure) {
-        throw OpenMMException(std::string("VariableStepRattleIntegrator: ") + failure.what());
+        throw OpenMMException(getName() + ": " + failure.what());
     }
     const bool isSameGroup =
         settings.usesMonitorForceGroup() == applied.usesMonitorForceGroup() &&
@@ -134,7 +139,7 @@ void IntegratorRun::takeSaved() {
         isAtStart = isAtStart && !goesOn;
     }
     catch (const StepFailure& failure) {
-        throwFailure("going on from a saved run", device.getTime(), failure.what(), "");
+        throwFailure(settings, "going on from a saved run", device.getTime(), failure.what(), "");
     }
     saved.reset();
 }
@@ -172,7 +177,7 @@ void IntegratorRun::prepare(bool areForcesInvalid, bool isForStep) {
         areForcesChanged = false;
     }
     catch (const StepFailure& failure) {
-        throwFailure("the start", device.getTime(), failure.what(), "");
+        throwFailure(settings, "the start", device.getTime(), failure.what(), "");
     }
 }
 
@@ -201,8 +206,10 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
             toldSize = size;
             toldDensity = density;
         }
-        throwFailure("the step", device.getTime(), failure.what(),
-                     "; the Context is in the state before this step: use a smaller step size, or another monitor");
+        throwFailure(settings, "the step", device.getTime(), failure.what(),
+                     settings.langevin ? "; the Context is in the state before this step"
+                                       : "; the Context is in the state before this step: use a smaller step size, or "
+                                         "another monitor");
     }
 }
 
@@ -229,7 +236,7 @@ void IntegratorRun::reverse() {
         device.reverse();
     }
     catch (const StepFailure& failure) {
-        throwFailure("reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
+        throwFailure(settings, "reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
     }
     toldDensity.reset();
 }
@@ -256,7 +263,7 @@ vector<double> IntegratorRun::calibrate(int steps) {
         }
     }
     catch (const StepFailure& failure) {
-        throwFailure("calibrate()", device.getTime(), failure.what(),
+        throwFailure(settings, "calibrate()", device.getTime(), failure.what(),
                      "; the Context is unchanged: use a smaller step size");
     }
     for (size_t k = 0; k < means.size(); k++)
@@ -283,7 +290,7 @@ vector<double> IntegratorRun::findAutomaticReferences(int steps) {
         }
         catch (const StepFailure& failure) {
             if (halvings == MAX_HALVINGS)
-                throwFailure("calibrate()", device.getTime(), failure.what(),
+                throwFailure(settings, "calibrate()", device.getTime(), failure.what(),
                              "; the Context is unchanged: use a smaller step size");
             stepSize *= 0.5;
             continue;
@@ -340,6 +347,19 @@ vector<double> IntegratorRun::getMultipliers() {
     return device.getMultipliers();
 }
 
+double IntegratorRun::computeKineticEnergy() {
+    if (!settings.langevin || settings.stepSize == 0)
+        return device.computeKineticEnergy();
+    try {
+        prepare(false);
+    }
+    catch (const OpenMMException&) {
+        // No step could begin with the state of the Context: what its velocities have is all there is to say.
+        return device.computeKineticEnergy();
+    }
+    return device.computeHalfStepKineticEnergy();
+}
+
 // ------------------------------------------------------------------------------------------------ saving and resuming
 
 RunState IntegratorRun::save() {
@@ -357,6 +377,7 @@ RunState IntegratorRun::save() {
     run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
     run.lastDensity = getStepDensity();
     run.references = getReferences();
+    run.randomState = device.getRandomState();
     if (!run.startsAfresh)
         device.save(run);
     return run;
@@ -382,6 +403,8 @@ void IntegratorRun::resume(const RunState& run) {
     takeSettings();
     if ((int) run.references.size() == settings.getNumReferences())
         device.setReferences(run.references);
+    if (!run.randomState.empty())
+        device.setRandomState(run.randomState);
     if (run.system == system && !run.startsAfresh && device.canResume(run, settings))
         saved = std::make_unique<RunState>(run);
 }

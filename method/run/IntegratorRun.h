@@ -9,6 +9,7 @@
 #include "run/RunState.h"
 #include <memory>
 #include <optional>
+#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -51,6 +52,8 @@ public:
     double getReference(int index);
     double getMonitorValue(int index);
     std::vector<double> getMultipliers();
+    /** What is reported as the kinetic energy of the Context; at constant temperature it is one of the method's state. */
+    double computeKineticEnergy();
     RunDevice& getDevice() {
         return device;
     }
@@ -75,6 +78,7 @@ public:
 private:
     /** What is to be done before the next step, from the least to the greatest. */
     enum class Task { None, ChangeVelocities, ChangeState, Start };
+    std::string getName() const;
     void requireStepSize() const;
     bool areConstraintsOthers() const;
     bool canTakeSettings() const;

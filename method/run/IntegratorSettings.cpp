@@ -22,6 +22,10 @@ IntegratorSettings::IntegratorSettings(double stepSize) : stepSize(stepSize) {
     monitors.push_back({StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0});
 }
 
+IntegratorSettings::IntegratorSettings(double stepSize, const LangevinSettings& langevin) :
+        stepSize(stepSize), isDefaultMonitor(false), langevin(langevin) {
+}
+
 double IntegratorSettings::getMinimumStep() const {
     const double factor = isAutomatic ? AUTOMATIC_MINIMUM_FACTOR : DEFAULT_MINIMUM_FACTOR;
     return minimumStep == USE_DEFAULT ? factor * stepSize : minimumStep;
@@ -47,14 +51,14 @@ void IntegratorSettings::fitDefaultMonitor(bool hasConstraints) {
 
 bool IntegratorSettings::isConsistent() const {
     const double minimum = getMinimumStep(), maximum = getMaximumStep();
-    return stepSize == 0 || (minimum < stepSize && (isAutomatic || maximum == 0 || stepSize < maximum));
+    return langevin || stepSize == 0 || (minimum < stepSize && (isAutomatic || maximum == 0 || stepSize < maximum));
 }
 
 void IntegratorSettings::requireConsistent() const {
     if (isConsistent())
         return;
     std::stringstream message;
-    message << "VariableStepRattleIntegrator: the minimum step size (" << getMinimumStep()
+    message << getIntegratorName() << ": the minimum step size (" << getMinimumStep()
             << " ps) must be smaller than the nominal one (" << stepSize << " ps)";
     if (!isAutomatic)
         message << ", and the maximum step size (" << getMaximumStep()

@@ -6,14 +6,16 @@
 
 #include "expressions/ExpressionGroup.h"
 #include "step/AutomaticControl.h"
+#include "step/LangevinSettings.h"
 #include "step/StepDensity.h"
 #include "step/StepMonitor.h"
+#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * Everything that a user has chosen of a VariableStepRattleIntegrator, as one value: what XML stores, copies share, saved runs
+ * Everything that a user has chosen of one of the integrators, as one value: what XML stores, copies share, saved runs
  * bring back and devices are given. Numbers that the run finds by itself are not in it.
  */
 struct IntegratorSettings {
@@ -40,20 +42,37 @@ struct IntegratorSettings {
     double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
     int automaticRequest = 0; // changes when references in force are to be forgotten
 
+    // Constant temperature, in place of all that varies the step.
+    std::optional<LangevinSettings> langevin;
+
     std::vector<ExpressionConstraint> expressions;
 
     /** @param stepSize    the nominal step (ps) */
     explicit IntegratorSettings(double stepSize);
+    /** @param langevin    at which temperature, and how */
+    IntegratorSettings(double stepSize, const LangevinSettings& langevin);
+    /** The class of the integrator that has such settings, which is what messages begin with. */
+    const char* getIntegratorName() const {
+        return langevin ? "VariableStepRattleLangevinIntegrator" : "VariableStepRattleIntegrator";
+    }
+    /** The seed of random numbers; 0 where there is none, or each Context has another one. */
+    int getRandomSeed() const {
+        return langevin ? langevin->randomSeed : 0;
+    }
+    void setRandomSeed(int seed) {
+        if (langevin)
+            langevin->randomSeed = seed;
+    }
     /** The bounds in force (ps), 0 for none; those that were not set follow the nominal step. */
     double getMinimumStep() const;
     double getMaximumStep() const;
-    /** The number of values and references: of the monitors, or of automatic step control. */
+    /** The number of values and references: of the monitors, of automatic step control, or U_ref at constant temperature. */
     int getNumReferences() const {
-        return isAutomatic ? AutomaticControl::NUM_MONITORS : (int) monitors.size();
+        return langevin ? 1 : isAutomatic ? AutomaticControl::NUM_MONITORS : (int) monitors.size();
     }
     /** The reference value that was set; 0 if there is none. */
     double& reference(int index) {
-        return isAutomatic ? automaticReferences[index] : monitors[index].reference;
+        return langevin ? langevin->reference : isAutomatic ? automaticReferences[index] : monitors[index].reference;
     }
     double getReference(int index) const {
         return const_cast<IntegratorSettings*>(this)->reference(index);

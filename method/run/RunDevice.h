@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_RUNDEVICE_H_
 #define OPENMMVRATTLE_RUNDEVICE_H_
 
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -132,6 +133,8 @@ public:
 
     // -------------------------------------------------------------------------------------- trial runs of fixed steps
 
+    // Of methods that are calibrated with them; others need none of these.
+
     /**
      * Begin to take steps of a fixed size from the method's state, which have no density and are put back by endTrial(). What is
      * asked of the device in between concerns the trial. Forces see the time of the trial, and the step count that there is.
@@ -139,11 +142,16 @@ public:
      * @param stepSize       the size of all steps (ps)
      * @param isBackwards    whether they go back in time (from the same positions with velocities of the other sign)
      */
-    virtual void beginTrial(double stepSize, bool isBackwards) = 0;
+    virtual void beginTrial(double stepSize, bool isBackwards) {
+        (void) stepSize, (void) isBackwards;
+        throw std::logic_error("this method has no trial runs");
+    }
     /** Take one; may throw a StepFailure at once. The trial is over then too, and its effects put back. */
-    virtual void takeTrialStep() = 0;
+    virtual void takeTrialStep() {
+    }
     /** Put back everything but the counts of work. Does nothing if there is no trial. */
-    virtual void endTrial() = 0;
+    virtual void endTrial() {
+    }
 
     // -------------------------------------------------------------------------------------- numbers at the method's state
 
@@ -160,18 +168,43 @@ public:
     /** How often forces have been computed, iterations of the solver taken, and steps rescued, since the device exists. */
     virtual long long getNumForceEvaluations() = 0;
     virtual long long getNumSolverIterations() = 0;
-    virtual long long getNumRescues() = 0;
+    virtual long long getNumRescues() {
+        return 0;
+    }
 
     // ---------------------------------------------------------------------------------------- automatic step control
 
     /** A value of its monitors that is no more than this is nothing but rounding. */
-    virtual double getNegligibleValue() = 0;
+    virtual double getNegligibleValue() {
+        return 0;
+    }
     /** The most steps in a row that were shorter than a tenth of the nominal one. */
     virtual long long getNumShortSteps() {
         return 0;
     }
 
+    // ------------------------------------------------------------------------------------------ constant temperature
+
+    /** The kinetic energy that is reported where it is not that of the Context's velocities; the two states agree. */
+    virtual double computeHalfStepKineticEnergy() {
+        return computeKineticEnergy();
+    }
+    /** How many steps have been made of substeps since the device exists, and of how many at most. */
+    virtual long long getNumSubstepped() {
+        return 0;
+    }
+    virtual int getLargestSubsteps() {
+        return 1;
+    }
+
     // ------------------------------------------------------------------------------------------- saving and resuming
+
+    /** The seed in force and how many steps have drawn random numbers with it; empty if there are none. */
+    virtual std::vector<double> getRandomState() {
+        return {};
+    }
+    virtual void setRandomState(const std::vector<double>&) {
+    }
 
     /**
      * Write down what the method goes on with beside settings and the state of the Context: all of RunState behind startsAfresh.

@@ -19,7 +19,7 @@ using std::vector;
 namespace {
 
 [[noreturn]] void throwDamaged() {
-    throw OpenMMException("VariableStepRattleIntegrator: the saved state of the run is damaged, its parts do not fit "
+    throw OpenMMException("OpenMM-VRATTLE: the saved state of the run is damaged, its parts do not fit "
                           "together");
 }
 
@@ -103,6 +103,7 @@ void RunState::write(std::ostream& stream) const {
     writeValue(stream, lastStepSize);
     writeValue(stream, lastDensity);
     writeArray(stream, references);
+    writeArray(stream, randomState);
     writeValue(stream, startsAfresh);
     if (startsAfresh)
         return;
@@ -130,6 +131,7 @@ void RunState::read(std::istream& stream) {
     readValue(stream, lastStepSize);
     readValue(stream, lastDensity);
     readArray(stream, references);
+    readArray(stream, randomState);
     readValue(stream, startsAfresh);
     if (startsAfresh)
         return;
@@ -156,6 +158,8 @@ void RunState::write(SerializationNode& node) const {
     node.setLongProperty("parameters", (long long) parameters).setBoolProperty("areForcesOutdated", areForcesOutdated);
     node.setDoubleProperty("lastStepSize", lastStepSize).setDoubleProperty("lastDensity", lastDensity);
     writeArray(node, "References", references);
+    if (!randomState.empty())
+        writeArray(node, "RandomState", randomState);
     node.setBoolProperty("startsAfresh", startsAfresh);
     if (startsAfresh)
         return;
@@ -181,6 +185,9 @@ void RunState::read(const SerializationNode& node) {
     lastStepSize = node.getDoubleProperty("lastStepSize");
     lastDensity = node.getDoubleProperty("lastDensity");
     readArray(node, "References", references);
+    for (const SerializationNode& child : node.getChildren())
+        if (child.getName() == "RandomState")
+            readArray(node, "RandomState", randomState);
     startsAfresh = node.getBoolProperty("startsAfresh");
     if (startsAfresh)
         return;
@@ -212,8 +219,9 @@ const vector<double>& RunState::getMethodValues(const string& name, size_t count
 void RunState::requireSizes(int numParticles, int numMonitors) const {
     bool fits = (int) references.size() == numMonitors;
     if (!startsAfresh)
-        fits = fits && (int) halfStepVelocities.size() == numParticles && (int) forces.size() == numParticles;
-    for (const vector<Vec3>* optional : {&positions, &velocities, &contextPositions, &contextVelocities})
+        fits = fits && (int) forces.size() == numParticles;
+    for (const vector<Vec3>* optional :
+         {&halfStepVelocities, &positions, &velocities, &contextPositions, &contextVelocities})
         fits = fits && (optional->empty() || (int) optional->size() == numParticles);
     if (!fits)
         throwDamaged();

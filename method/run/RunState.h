@@ -47,11 +47,12 @@ struct RunState {
     double lastStepSize = 0;           // ps; 0 before the first step
     double lastDensity = 1;            // rho of the last step
     std::vector<double> references;    // U_k,ref in force, 0 if not known
+    std::vector<double> randomState;   // RunDevice::getRandomState()
     bool startsAfresh = true;          // no step since the user changed the state: nothing of what follows is there
 
     // The numbers that the method goes on with, by names that the device gives them.
     std::map<std::string, std::vector<double>> methodValues;
-    std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
+    std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2], of methods that have it
     std::vector<OpenMM::Vec3> forces;  // F(q[n])
     double groupEnergy = 0;            // of the monitor's force group at q[n], kJ/mol
     OpenMM::Vec3 boxVectors[3];        // those of the forces

@@ -75,14 +75,6 @@ double applyDeadZone(double u) {
     return sixteenthRoot(1 + fourth(beyond));
 }
 
-// (sum x^4)^(1/8)
-double eighthRootOfFourthPowers(const vector<double>& x) {
-    double sum = 0;
-    for (double each : x)
-        sum += (each * each) * (each * each);
-    return std::sqrt(std::sqrt(std::sqrt(sum)));
-}
-
 void requireFinite(double value, const char* name) {
     if (!std::isfinite(value))
         throw StepFailure(std::string("the monitor ") + name +
@@ -92,34 +84,20 @@ void requireFinite(double value, const char* name) {
 } // namespace
 
 AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
-        solver(solver), system(solver.getSystem()), movingParticles(solver.getMovingParticles()),
-        numClusters((int) system.getClusters().size()), references(), memory(), temperature(0), measured() {
-    vector<int> clusters(system.getNumParticles(), -1);
-    for (int c = 0; c < numClusters; c++)
-        for (int i : system.getClusterParticles(c))
-            clusters[i] = c;
-    for (int i : movingParticles) {
-        if (clusters[i] < 0)
-            clusters[i] = numClusters++;
-        clusterOfParticle.push_back(clusters[i]);
-    }
+        system(solver.getSystem()), clusterForces(solver), movingParticles(solver.getMovingParticles()),
+        clusterOfParticle(clusterForces.getClusters()), numClusters(clusterForces.getNumClusters()), references(),
+        memory(), temperature(0), measured() {
     numDegreesOfFreedom = std::max(1.0, 3.0 * (double) movingParticles.size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
-    netForces.resize(system.getNumParticles());
 }
 
 // -------------------------------------------------------------------------------------------------------- the monitors
 
-// N = F - G^T Lambda
-void AutomaticControl::findNetForces(const State& state) {
-    netForces = state.forces;
-    solver.subtractConstraintForces(state.positions, state.parameters, state.multipliers, netForces);
-}
-
 // S_c and 2K/f
 void AutomaticControl::findSquares(const State& state, vector<double>& squares) {
-    findNetForces(state);
+    const vector<Vec3>& netForces =
+        clusterForces.findNetForces(state.positions, state.parameters, state.forces, state.multipliers);
     std::fill(squares.begin(), squares.end(), 0.0);
     temperature = 0;
     for (size_t p = 0; p < movingParticles.size(); p++) {
@@ -139,7 +117,7 @@ double AutomaticControl::evaluateOnStep(const State& state, const vector<double>
         const Vec3 &force = state.forces[i], &v = state.velocities[i];
         scratch[clusterOfParticle[p]] += std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
     }
-    return eighthRootOfFourthPowers(scratch);
+    return ClusterForces::eighthRootOfFourthPowers(scratch);
 }
 
 void AutomaticControl::begin(const State& state) {
@@ -160,7 +138,7 @@ void AutomaticControl::measure(const State& state, const vector<Vec3>& w, double
     for (int c = 0; c < numClusters; c++)
         scratch[c] =
             CHANGE_WEIGHT * 2 / size * std::fabs(scratch[c]) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
-    measured[HalfStep] = eighthRootOfFourthPowers(scratch);
+    measured[HalfStep] = ClusterForces::eighthRootOfFourthPowers(scratch);
     requireFinite(measured[HalfStep], "U_B");
 }
 

@@ -6,6 +6,7 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
+#include "step/ClusterForces.h"
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -138,7 +139,6 @@ private:
     double target(int monitor, double value) const;
     double combine(const double (&transformed)[NUM_MONITORS]) const;
     double limit(double density) const;
-    void findNetForces(const State& state);
     void findSquares(const State& state, std::vector<double>& squares);
     double evaluateOnStep(const State& state, const std::vector<double>& squares);
     double thermalValue(double temperature) const;
@@ -153,10 +153,9 @@ private:
     void follow(double part);
     void raiseReferences();
 
-    ConstraintSolver& solver;
     const ConstraintSystem& system;
-    const std::vector<int>& movingParticles;
-    std::vector<int> clusterOfParticle; // of each moving particle in that order
+    ClusterForces clusterForces;
+    const std::vector<int>&movingParticles, &clusterOfParticle;
     int numClusters;
     double numDegreesOfFreedom;
     Settings settings;
@@ -165,7 +164,6 @@ private:
     double temperature; // 2K/f of the state that was looked at last
     double measured[NUM_MONITORS]; // by measure()
     std::vector<double> measuredSquares, scratch;
-    std::vector<OpenMM::Vec3> netForces;
 };
 
 } // namespace OpenMMVRattle

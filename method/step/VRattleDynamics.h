@@ -7,6 +7,7 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include "step/AutomaticControl.h"
+#include "step/Dynamics.h"
 #include "step/StepDensity.h"
 #include "step/StepMonitor.h"
 #include <functional>
@@ -28,7 +29,7 @@ namespace OpenMMVRattle {
  * Until finish() has returned, the state before the step is untouched. Momenta are kept as velocities: v stands for
  * M^-1 p[n], w for M^-1 p[n-1/2].
  */
-class VRattleDynamics {
+class VRattleDynamics : public Dynamics {
 public:
     /** What a user can choose. */
     struct Settings {
@@ -66,12 +67,7 @@ public:
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
 
-    typedef ConstraintSolver::Parallel Parallel;
-    /**
-     * Let threads share the clusters, and the pieces of large ones, where that is faster. Results do not depend on the number of
-     * threads, to the last bit.
-     */
-    void setParallel(const Parallel& parallel, int numThreads);
+    void setParallel(const Parallel& parallel, int numThreads) override;
 
     /**
      * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
@@ -81,22 +77,9 @@ public:
      */
     void setSettings(const Settings& settings);
 
-    /**
-     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
-     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
-     *
-     * @return whether the positions were changed
-     * @throws StepFailure    if there is no such configuration nearby
-     */
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
-    /**
-     * Start afresh at a state. The velocities are projected onto the constraints, whose parameters, those in force, are at rest
-     * and stay so until others are set.
-     *
-     * @throws StepFailure    if the multipliers or monitors are not defined there; then everything is as it was
-     */
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions) override;
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-               const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
     /** All that a trial run or a start changes, to be put back. */
     struct Kept {
         Settings settings;
@@ -109,21 +92,22 @@ public:
     Kept keep() const;
     /** Put back what was kept, to the last bit. */
     void putBack(const Kept& kept);
+    std::function<void()> remember() override {
+        return [this, kept = keep()] { putBack(kept); };
+    }
     Memory getMemory() const;
     /**
      * Change the parameters of an expression: the next step leads to positions that satisfy the constraint with these, in that
      * its position equation is g(q[n+1]; theta[n+1]) = 0 (3.11), and the velocities at its end
      * G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
      */
-    void setParameters(int expression, const std::map<std::string, double>& parameters) {
+    void setParameters(int expression, const std::map<std::string, double>& parameters) override {
         getConstraintSystem().writeParameters(expression, parameters, target);
     }
-    /** theta[n], those in force, and the rates of the step that has led to them. */
-    const ExpressionParameters& getParameters() const {
+    const ExpressionParameters& getParameters() const override {
         return theta;
     }
-    /** Put those that are set in force at once, before positions are projected and the run starts afresh with begin(). */
-    void adoptParameters();
+    void adoptParameters() override;
     /**
      * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
      * following steps are the same to the last bit if the forces are.
@@ -144,28 +128,20 @@ public:
                double offset);
     /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
     double findHalfStepValue();
-    /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
-    void setReferences(const std::vector<double>& references);
+    void setReferences(const std::vector<double>& references) override;
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
-    /**
-     * Go on with velocities that are the present ones seen from a uniformly moving frame, as a remover of the motion of the
-     * centre of mass leaves them in each step. Constraints between moving particles and their multipliers know nothing of it, so
-     * that it costs no more than to look.
-     *
-     * @return whether that is what they are; if not, nothing has been changed
-     */
-    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities) override;
     /** Go on with changed velocities at the same positions; as changeState(). */
-    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities) override;
     /**
      * Go on with other forces at the same positions and velocities, since a parameter of a force has changed; as changeState().
      *
      * @param[in,out] forces    the applied forces; their storage is taken over, and that of the forces before left in its place
      * @throws StepFailure    if they are not finite; then nothing has been changed
      */
-    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
 
     /**
      * The first half of a step.
@@ -174,7 +150,7 @@ public:
      * @return the size of the step (ps)
      * @throws StepFailure    if the equations of the step have no solution that the iteration finds
      */
-    double step(double maxStep);
+    double step(double maxStep) override;
     /**
      * The second half of a step.
      *
@@ -185,12 +161,12 @@ public:
      *         better, and both halves are to be done again. This happens once, at a start with given reference values.
      * @throws StepFailure    if the forces are not finite or the constraints have become dependent
      */
-    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
     /**
      * The step in progress has failed, in either half or in between: nothing that was computed for it, as the density and the
      * reference values of a first step, is of any use to the next.
      */
-    void abandonStep();
+    void abandonStep() override;
     /** Whether the next step continues a sequence of densities; if not, it is the first one. */
     bool hasStarted() const {
         return hasDensity;
@@ -199,47 +175,40 @@ public:
     const AutomaticControl& getAutomaticControl() const {
         return automatic;
     }
-    /** Turn time around, without a force. */
-    void reverse();
+    void reverse() override;
 
-    const ConstraintSystem& getConstraintSystem() const {
+    const ConstraintSystem& getConstraintSystem() const override {
         return solver.getSystem();
     }
-    /** q[n]. */
-    const std::vector<OpenMM::Vec3>& getPositions() const {
+    const std::vector<OpenMM::Vec3>& getPositions() const override {
         return q;
     }
     /** q[n+1], after step(). */
-    const std::vector<OpenMM::Vec3>& getNextPositions() const {
+    const std::vector<OpenMM::Vec3>& getNextPositions() const override {
         return qNext;
     }
-    /** M^-1 p[n]. */
-    const std::vector<OpenMM::Vec3>& getVelocities() const {
+    const std::vector<OpenMM::Vec3>& getVelocities() const override {
         return v;
     }
-    /** F(q[n]). */
-    const std::vector<OpenMM::Vec3>& getForces() const {
+    const std::vector<OpenMM::Vec3>& getForces() const override {
         return force;
     }
-    /** The energy of the monitor's force group at q[n]. */
-    double getGroupEnergy() const {
+    double getGroupEnergy() const override {
         return groupEnergy;
     }
     /** rho[n-1/2]. */
-    double getDensity() const {
+    double getDensity() const override {
         return rho;
     }
-    /** U_k(q[n],p[n]). */
-    const std::vector<double>& getMonitorValues() const {
+    const std::vector<double>& getMonitorValues() const override {
         return values;
     }
     /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
-    std::vector<double> getReferences() const;
-    /** Lambda(q[n],p[n]) for the constraints as ConstraintSystem writes them, in internal order. */
-    const std::vector<double>& getMultipliers() const {
+    std::vector<double> getReferences() const override;
+    const std::vector<double>& getMultipliers() const override {
         return lambda;
     }
-    long long getNumIterations() const {
+    long long getNumIterations() const override {
         return solver.getNumIterations() + numNewtonIterations;
     }
     long long getNumRescues() const {

@@ -36,8 +36,9 @@ int particleOfCoordinate(const string& name) {
 
 } // namespace
 
-void requireValidExpression(const string& expression, int numParticles, const std::map<string, double>& parameters) {
-    const string constraint = "VariableStepRattleIntegrator: the constraint \"" + expression + "\" ";
+void requireValidExpression(const string& expression, int numParticles, const std::map<string, double>& parameters,
+                            const string& integratorName) {
+    const string constraint = integratorName + ": the constraint \"" + expression + "\" ";
     std::set<string> variables;
     try {
         findVariables(Lepton::Parser::parse(expression).getRootNode(), variables);

@@ -16,9 +16,10 @@ namespace OpenMMVRattle {
  * @param expression      the expression
  * @param numParticles    the number of particles of the constraint
  * @param parameters      the parameters of the constraint
+ * @param integratorName    whose messages these are
  */
 void requireValidExpression(const std::string& expression, int numParticles,
-                            const std::map<std::string, double>& parameters);
+                            const std::map<std::string, double>& parameters, const std::string& integratorName);
 
 } // namespace OpenMMVRattle
 

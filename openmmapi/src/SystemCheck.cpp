@@ -29,15 +29,13 @@ using std::vector;
 
 namespace {
 
-const string PREFIX = "VariableStepRattleIntegrator: ";
-
 void requireMasses(const System& system) {
     for (int i = 0; i < system.getNumParticles(); i++) {
         const double mass = system.getParticleMass(i);
         if (mass >= 0 && std::isfinite(mass))
             continue;
         std::stringstream message;
-        message << PREFIX << "the mass of particle " << i << " is " << mass
+        message << "the mass of particle " << i << " is " << mass
                 << " amu, and masses are positive, or 0 for a particle that does not move; correct it with "
                    "setParticleMass() of the System";
         throw OpenMMException(message.str());
@@ -46,7 +44,7 @@ void requireMasses(const System& system) {
 
 // To begin a message with.
 string nameOf(const vector<ExpressionConstraint>& expressions, size_t index) {
-    return PREFIX + "expression constraint " + std::to_string(index) + " (" + expressions[index].expression + ") ";
+    return "expression constraint " + std::to_string(index) + " (" + expressions[index].expression + ") ";
 }
 
 void requireExpressions(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
@@ -78,7 +76,7 @@ void requireConstraints(const System& system) {
         double length;
         system.getConstraintParameters(i, particle1, particle2, length);
         const auto refuse = [&](const string& reason) {
-            throw OpenMMException(PREFIX + "constraint " + std::to_string(i) + " of the System, of the particles " +
+            throw OpenMMException("constraint " + std::to_string(i) + " of the System, of the particles " +
                                   std::to_string(particle1) + " and " + std::to_string(particle2) + ", " + reason);
         };
         if (!(length > 0) || !std::isfinite(length)) {
@@ -104,9 +102,9 @@ bool usesKernel(const ForceImpl& force, const string& name) {
 // own, which we do not link with, so it is recognised by its kernel.
 void refuseDrudeParticles(const ForceImpl& force) {
     if (usesKernel(force, "CalcDrudeForce"))
-        throw OpenMMException(PREFIX + "the System has a DrudeForce and Drude particles need an integrator made for "
-                                       "them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
-                                       "DrudeLangevinIntegrator, or a force field without Drude particles");
+        throw OpenMMException("the System has a DrudeForce and Drude particles need an integrator made for "
+                              "them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
+                              "DrudeLangevinIntegrator, or a force field without Drude particles");
 }
 
 // For each particle the number of its group.
@@ -189,9 +187,7 @@ void requireKnownGroups(const ContextImpl& context, const ForceImpl& impl,
     }
 }
 
-} // namespace
-
-void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
+void requireSuitable(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
     const System& system = context.getSystem();
     requireMasses(system);
     requireConstraints(system);
@@ -200,5 +196,17 @@ void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const vector<Exp
         refuseDrudeParticles(*force);
         if (!expressions.empty())
             requireKnownGroups(context, *force, expressions);
+    }
+}
+
+} // namespace
+
+void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const vector<ExpressionConstraint>& expressions,
+                                          const string& integratorName) {
+    try {
+        requireSuitable(context, expressions);
+    }
+    catch (const OpenMMException& error) {
+        throw OpenMMException(integratorName + ": " + error.what());
     }
 }

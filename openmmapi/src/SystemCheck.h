@@ -14,9 +14,11 @@ namespace OpenMMVRattle {
  * Refuse what can be known to go wrong before there are positions: masses that are no masses, constraints on virtual sites, Forces
  * that need an integrator of their own, and Forces that would give a wrong ensemble since they know the System's constraints alone.
  *
- * @throws OpenMMException    which names what it is and the way out
+ * @param integratorName       whose messages these are
+ * @throws OpenMMException     which names what it is and the way out
  */
-void requireSuitableSystem(OpenMM::ContextImpl& context, const std::vector<ExpressionConstraint>& expressions);
+void requireSuitableSystem(OpenMM::ContextImpl& context, const std::vector<ExpressionConstraint>& expressions,
+                           const std::string& integratorName);
 
 } // namespace OpenMMVRattle
 

@@ -26,19 +26,20 @@ from .serialization import XmlSerializer
 
 if TYPE_CHECKING:
     from .compare.advice import advise
-    from .integrators import VariableStepRattleIntegrator
+    from .integrators import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
 
 __all__ = [
     "ConstraintWarning",
     "CustomVariableStepRattleIntegrator",
     "VariableStepRattleIntegrator",
+    "VariableStepRattleLangevinIntegrator",
     "XmlSerializer",
     "advise",
     "constraints",
     "pluginLoadFailures",
 ]
 # What of these needs the compiled part of the package.
-_COMPILED = ("VariableStepRattleIntegrator", "advise")
+_COMPILED = ("VariableStepRattleIntegrator", "VariableStepRattleLangevinIntegrator", "advise")
 
 # The platforms that each of our libraries serves. The CPU platform runs the kernels of Reference.
 _PLATFORMS_OF_LIBRARY: dict[str, tuple[str, ...]] = {
@@ -91,9 +92,10 @@ def _load_compiled_part() -> list[str]:
 
     _check_openmm_version(_build.OPENMM_VERSION, openmm.version.short_version)
     from . import _vrattle
-    from .integrators import VariableStepRattleIntegrator
+    from .integrators import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
 
     globals()["VariableStepRattleIntegrator"] = VariableStepRattleIntegrator
+    globals()["VariableStepRattleLangevinIntegrator"] = VariableStepRattleLangevinIntegrator
     # Found from the extension: in an editable install the Python files lie somewhere else.
     failures = _load_plugins(Path(_vrattle.__file__).parent / "lib" / "plugins")
     from .compare.advice import advise

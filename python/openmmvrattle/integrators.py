@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import openmm
 from openmm import unit
@@ -18,9 +18,13 @@ from openmm import unit
 from . import vrattle
 from ._arguments import constraint_arguments, integer, monitor_arguments, number, parameter
 
-__all__ = ["VariableStepRattleIntegrator"]
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["ConstrainedIntegrator", "VariableStepRattleIntegrator", "VariableStepRattleLangevinIntegrator"]
 
 _TIME = unit.picosecond
+_FRICTION = unit.picosecond**-1
 _MANY_SHORT_STEPS = 1000
 _MULTIPLIER = unit.kilojoule_per_mole / unit.nanometer**2
 
@@ -29,7 +33,324 @@ def _deprecated(name: str, instead: str) -> None:
     warnings.warn(f"{name} is deprecated: use {instead}", DeprecationWarning, stacklevel=3)
 
 
-class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
+def _cast(integrator: openmm.Integrator, wanted: type, compiled: Any) -> Any:
+    """Return the same Python object as a `wanted`, whose compiled class is `compiled`."""
+    if isinstance(integrator, wanted):
+        return integrator
+    typed = compiled._cast(integrator)
+    if typed is None:
+        raise TypeError(f"a {type(integrator).__name__} is not a {wanted.__name__}")
+    typed.thisown = integrator.thisown
+    integrator.thisown = False
+    integrator.this = typed.this
+    integrator.__class__ = wanted
+    return integrator
+
+
+class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
+    """What the compiled integrators have in common: constraints given as expressions, and their multipliers; counts of
+    work; copies."""
+
+    this: Any  # what SWIG keeps the C++ object in
+
+    def setVelocitiesToTemperature(self, temperature: float | unit.Quantity, randomSeed: int | None = None) -> None:
+        """Give the particles of the Context random velocities of a temperature that satisfy all constraints.
+
+        Those given as expressions too: each velocity is drawn from Maxwell's distribution, and all together are
+        projected onto the constraints in the metric of the masses, so that the mean kinetic energy is kT/2 for each
+        degree of freedom that the constraints leave. It does what setVelocitiesToTemperature() of the Context does,
+        whose solver leaves expressions alone and can fail where constraints are strongly coupled.
+
+        Where the positions do not satisfy the constraints, the velocities satisfy them at the positions that the next
+        step starts from. The forces are computed once, for that step.
+
+        Parameters
+        ----------
+        temperature : float or Quantity
+            the temperature (in K); not negative
+        randomSeed : int
+            the same seed gives the same velocities. Default: another one at each call
+
+        Raises
+        ------
+        OpenMMException
+            if the temperature is negative or not finite, there is no Context, or its positions are no start for a run;
+            the velocities are then as before
+        """
+        seed = () if randomSeed is None else (integer(randomSeed, "randomSeed"),)
+        super().setVelocitiesToTemperature(number(temperature, "temperature", unit.kelvin), *seed)
+
+    def getMultipliers(self) -> unit.Quantity:
+        """Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in
+        the order of the System's constraints, and behind them those of addConstraint().
+
+        The force of constraint k of the System, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle i and
+        the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d. The force of
+        any constraint g = 0 on a particle is -Lambda_k dg/dq. Before the first step this computes the forces.
+
+        Returns
+        -------
+        Quantity
+            a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles. Those of
+            addConstraint() are numbers in kJ/mol over the unit of the expression, whatever the unit of the list says;
+            see getExpressionConstraintMultiplier()
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context
+        """
+        return unit.Quantity(list(super().getMultipliers()), _MULTIPLIER)
+
+    def getExpressionConstraintMultiplier(self, index: int) -> float:
+        """Get the Lagrange multiplier of one constraint of addConstraint(); see getMultipliers().
+
+        Where the expression is a reaction coordinate minus its value, it is the force that holds the coordinate there,
+        with the sign of a force against g.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint, as addConstraint() has returned it
+
+        Returns
+        -------
+        float
+            the multiplier, in kJ/mol over the unit of the expression
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or no Context
+        """
+        return super().getExpressionConstraintMultiplier(integer(index, "index"))
+
+    def getNumExpressionConstraints(self) -> int:
+        """Get the number of constraints that addConstraint() has added.
+
+        Returns
+        -------
+        int
+            their number
+        """
+        return super().getNumExpressionConstraints()
+
+    def setExpressionParameterValue(self, index: int, name: str, value: float | unit.Quantity) -> None:
+        """Change the value of one parameter of a constraint.
+
+        The next step moves the particles there: its end satisfies the constraint, with velocities v that belong to
+        the motion, dg/dq v = -dg/dparameter (new - old)/(size of the step). It costs no evaluation of the forces, and
+        the step density goes on. The work that the motion does on the particles is the multiplier times
+        dg/dparameter times the change of the parameter; take the mean of the multipliers before and after the step
+        (docs/constraints.md has an example). A change that no step can make fails as a step, and the value stays as
+        it was set. Before the first step after the user has set positions or velocities, numbers that are asked for
+        are those of particles put on the constraint, without a motion.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+        name : str
+            the name of the parameter
+        value : float or Quantity
+            its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or it has no such parameter, or the value is not finite
+        """
+        super().setExpressionParameterValue(integer(index, "index"), name, parameter(value, name))
+
+    def getNumForceEvaluations(self) -> int:
+        """Get how often the forces have been computed for this integrator since the Context was created or
+        reinitialized.
+
+        This count and the following ones are of the work done in this Context: they are not saved, and loading a
+        checkpoint or a State leaves them as they are.
+
+        Returns
+        -------
+        int
+            the number of force evaluations
+        """
+        return super().getNumForceEvaluations()
+
+    def getNumSolverIterations(self) -> int:
+        """Get how many iterations the solver of the constraints has taken since then, those of trial steps among them.
+
+        Returns
+        -------
+        int
+            the number of iterations
+        """
+        return super().getNumSolverIterations()
+
+    def setConstraintTolerance(self, tol: float) -> None:
+        """Set the relative tolerance of the constraints. Default: 1e-8.
+
+        For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of
+        0.1 nm, about the length of a bond, and the error that is compared with it is the distance of the particles from
+        where g = 0 holds, to first order: |g| over the Euclidean norm of the gradient of g with respect to the
+        particles that have mass. It is therefore the same for g and for 1000 g.
+
+        Parameters
+        ----------
+        tol : float
+            the tolerance; positive and finite
+
+        Raises
+        ------
+        OpenMMException
+            if tol is not a positive finite number
+        """
+        super().setConstraintTolerance(number(tol, "tol"))
+
+    def addConstraint(
+        self,
+        expression: str,
+        particles: Iterable[int],
+        parameters: Mapping[str, float | unit.Quantity] = {},
+    ) -> int:
+        """Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm,
+        which are called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters
+        of this constraint, which have names.
+
+        It has the syntax of OpenMM's custom forces: operators + - * / ^, their functions, and intermediate values
+        defined after a semicolon. Derivatives are found symbolically. Constraints that have the same expression, with
+        different particles and values of parameters, are evaluated together, which is much faster.
+
+            integrator.addConstraint("r - r0; r = sqrt((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2)", [3, 7], {"r0": 0.3})
+
+        Functions for the constraints that are asked for most are in openmmvrattle.constraints.
+
+        The gradient of g must not vanish where g = 0: a point is kept on a sphere by r - r0 or by r^2 - r0^2, but
+        not by (r - r0)^2. Coordinates are taken as they are, not as their nearest periodic images. A particle of
+        mass zero is a fixed point; at least one of the particles must have mass, and none may be a virtual site.
+
+        As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at
+        the first step. OpenMM itself knows nothing of it: Context.applyConstraints() and
+        applyVelocityConstraints() leave it alone, and a CompoundIntegrator's other integrators do not keep it. It
+        works on the platforms Reference and CPU.
+
+        A constraint that is added after the Context was created takes effect with Context.reinitialize(); until
+        then steps raise an exception.
+
+        Parameters
+        ----------
+        expression : str
+            the expression g
+        particles : list
+            the indices of the particles
+        parameters : dict
+            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
+
+        Returns
+        -------
+        int
+            the index of the constraint among those that were added
+
+        Raises
+        ------
+        OpenMMException
+            if the expression cannot be understood, contains anything but coordinates of the particles and the
+            parameters, or a particle is named twice
+        """
+        return super().addConstraint(*constraint_arguments(expression, particles, parameters))
+
+    def getExpressionConstraintParameters(self, index: int) -> tuple[str, list[int], dict[str, float]]:
+        """Get what a constraint was added with.
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+
+        Returns
+        -------
+        tuple
+            the expression, the list of the particles, and the dict of the parameters, as numbers in OpenMM's units
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index
+        """
+        index = integer(index, "index")
+        expression, particles = self._getExpression(index), list(self._getExpressionParticles(index))
+        return expression, particles, dict(self._getExpressionParameters(index))
+
+    def setExpressionConstraintParameters(
+        self,
+        index: int,
+        expression: str,
+        particles: Iterable[int],
+        parameters: Mapping[str, float | unit.Quantity] = {},
+    ) -> None:
+        """Change a constraint.
+
+        New values of its parameters are met by the next step, which moves the particles there; see
+        setExpressionParameterValue(). Another expression, other particles or other names take effect with
+        Context.reinitialize(), as for addConstraint().
+
+        Parameters
+        ----------
+        index : int
+            the index of the constraint
+        expression : str
+            the expression
+        particles : list
+            the indices of the particles
+        parameters : dict
+            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
+
+        Raises
+        ------
+        OpenMMException
+            if there is no constraint with this index, or addConstraint() would refuse it
+        """
+        super().setExpressionConstraintParameters(
+            integer(index, "index"), *constraint_arguments(expression, particles, parameters)
+        )
+
+    def _attributes(self) -> dict[str, object]:
+        """Return what Python code has attached to this integrator."""
+        return {name: value for name, value in self.__dict__.items() if name != "this"}
+
+    def __copy__(self) -> Self:
+        duplicate = type(self).cast(openmm.XmlSerializer.clone(self))
+        duplicate.__class__ = type(self)
+        duplicate.__dict__.update(copy.deepcopy(self._attributes()))
+        return duplicate
+
+    def __deepcopy__(self, memo: dict) -> Self:
+        return self.__copy__()
+
+    def __getstate__(self) -> tuple[str, dict[str, object]]:
+        return openmm.XmlSerializer.serialize(self), self._attributes()
+
+    def __setstate__(self, state: tuple[str, dict[str, object]]) -> None:
+        xml, attributes = state
+        self.this = type(self).cast(openmm.XmlSerializer.deserialize(xml)).this
+        self.__dict__.update(attributes)
+
+    def step(self, steps: int) -> None:
+        """Advance the simulation by a number of steps.
+
+        Parameters
+        ----------
+        steps : int
+            the number of steps to take
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context, or a step cannot be completed; the Context is then in the state before that step
+        """
+        super().step(integer(steps, "steps"))
+
+
+class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRattleIntegrator):
     """An integrator for molecular dynamics with constraints: steps of variable size that are time-reversible.
 
     So the energy error stays bounded over long runs. It is the method VRATTLE of E. Barth, B. Leimkuhler and S. Reich,
@@ -110,7 +431,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
     Wrong values raise an openmm.OpenMMException; arguments of a wrong type or unit raise a TypeError.
     """
 
-    this: Any  # what SWIG keeps the C++ object in
     SemiExplicit: int = vrattle.VariableStepRattleIntegrator.SemiExplicit
     Explicit: int = vrattle.VariableStepRattleIntegrator.Explicit
     Bounded: int = vrattle.VariableStepRattleIntegrator.Bounded
@@ -614,33 +934,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         super().calibrate(integer(steps, "steps"))
 
-    def setVelocitiesToTemperature(self, temperature: float | unit.Quantity, randomSeed: int | None = None) -> None:
-        """Give the particles of the Context random velocities of a temperature that satisfy all constraints.
-
-        Those given as expressions too: each velocity is drawn from Maxwell's distribution, and all together are
-        projected onto the constraints in the metric of the masses, so that the mean kinetic energy is kT/2 for each
-        degree of freedom that the constraints leave. It does what setVelocitiesToTemperature() of the Context does,
-        whose solver leaves expressions alone and can fail where constraints are strongly coupled.
-
-        Where the positions do not satisfy the constraints, the velocities satisfy them at the positions that the next
-        step starts from. The forces are computed once, for that step.
-
-        Parameters
-        ----------
-        temperature : float or Quantity
-            the temperature (in K); not negative
-        randomSeed : int
-            the same seed gives the same velocities. Default: another one at each call
-
-        Raises
-        ------
-        OpenMMException
-            if the temperature is negative or not finite, there is no Context, or its positions are no start for a run;
-            the velocities are then as before
-        """
-        seed = () if randomSeed is None else (integer(randomSeed, "randomSeed"),)
-        super().setVelocitiesToTemperature(number(temperature, "temperature", unit.kelvin), *seed)
-
     def getStepDensity(self) -> float:
         """Get the step density rho of the last step; 1 before the first step.
 
@@ -674,88 +967,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         return super().getMonitorValue(integer(index, "index"))
 
-    def getMultipliers(self) -> unit.Quantity:
-        """Get the Lagrange multipliers Lambda(q,p) (4.3) of the constraints at the current positions and velocities, in
-        the order of the System's constraints, and behind them those of addConstraint().
-
-        The force of constraint k of the System, g = |r|^2 - d^2 with r = q_i - q_j, is -2 Lambda_k r on particle i and
-        the opposite on j: a positive multiplier is a bond under tension, whose tension is 2 Lambda_k d. The force of
-        any constraint g = 0 on a particle is -Lambda_k dg/dq. Before the first step this computes the forces.
-
-        Returns
-        -------
-        Quantity
-            a list of the multipliers in kJ/mol/nm^2; 0 for a constraint between two massless particles. Those of
-            addConstraint() are numbers in kJ/mol over the unit of the expression, whatever the unit of the list says;
-            see getExpressionConstraintMultiplier()
-
-        Raises
-        ------
-        OpenMMException
-            if there is no Context
-        """
-        return unit.Quantity(list(super().getMultipliers()), _MULTIPLIER)
-
-    def getExpressionConstraintMultiplier(self, index: int) -> float:
-        """Get the Lagrange multiplier of one constraint of addConstraint(); see getMultipliers().
-
-        Where the expression is a reaction coordinate minus its value, it is the force that holds the coordinate there,
-        with the sign of a force against g.
-
-        Parameters
-        ----------
-        index : int
-            the index of the constraint, as addConstraint() has returned it
-
-        Returns
-        -------
-        float
-            the multiplier, in kJ/mol over the unit of the expression
-
-        Raises
-        ------
-        OpenMMException
-            if there is no constraint with this index, or no Context
-        """
-        return super().getExpressionConstraintMultiplier(integer(index, "index"))
-
-    def getNumExpressionConstraints(self) -> int:
-        """Get the number of constraints that addConstraint() has added.
-
-        Returns
-        -------
-        int
-            their number
-        """
-        return super().getNumExpressionConstraints()
-
-    def setExpressionParameterValue(self, index: int, name: str, value: float | unit.Quantity) -> None:
-        """Change the value of one parameter of a constraint.
-
-        The next step moves the particles there: its end satisfies the constraint, with velocities v that belong to
-        the motion, dg/dq v = -dg/dparameter (new - old)/(size of the step). It costs no evaluation of the forces, and
-        the step density goes on. The work that the motion does on the particles is the multiplier times
-        dg/dparameter times the change of the parameter; take the mean of the multipliers before and after the step
-        (docs/constraints.md has an example). A change that no step can make fails as a step, and the value stays as
-        it was set. Before the first step after the user has set positions or velocities, numbers that are asked for
-        are those of particles put on the constraint, without a motion.
-
-        Parameters
-        ----------
-        index : int
-            the index of the constraint
-        name : str
-            the name of the parameter
-        value : float or Quantity
-            its new value (in nm, ps, amu, kJ/mol, radian if it is a number)
-
-        Raises
-        ------
-        OpenMMException
-            if there is no constraint with this index, or it has no such parameter, or the value is not finite
-        """
-        super().setExpressionParameterValue(integer(index, "index"), name, parameter(value, name))
-
     def setExpressionConstraintParameter(self, index: int, name: str, value: float | unit.Quantity) -> None:
         """The same as setExpressionParameterValue().
 
@@ -777,30 +988,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         _deprecated("setExpressionConstraintParameter()", "setExpressionParameterValue()")
         self.setExpressionParameterValue(index, name, value)
-
-    def getNumForceEvaluations(self) -> int:
-        """Get how often the forces have been computed for this integrator since the Context was created or
-        reinitialized.
-
-        This count and the following ones are of the work done in this Context: they are not saved, and loading a
-        checkpoint or a State leaves them as they are.
-
-        Returns
-        -------
-        int
-            the number of force evaluations
-        """
-        return super().getNumForceEvaluations()
-
-    def getNumSolverIterations(self) -> int:
-        """Get how many iterations the solver of the constraints has taken since then, those of trial steps among them.
-
-        Returns
-        -------
-        int
-            the number of iterations
-        """
-        return super().getNumSolverIterations()
 
     def getNumRescues(self) -> int:
         """Get how many steps since the Context was created had to be rescued: the sum update gave no positive density,
@@ -827,26 +1014,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
             the number of steps
         """
         return super().getNumShortSteps()
-
-    def setConstraintTolerance(self, tol: float) -> None:
-        """Set the relative tolerance of the constraints. Default: 1e-8.
-
-        For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of
-        0.1 nm, about the length of a bond, and the error that is compared with it is the distance of the particles from
-        where g = 0 holds, to first order: |g| over the Euclidean norm of the gradient of g with respect to the
-        particles that have mass. It is therefore the same for g and for 1000 g.
-
-        Parameters
-        ----------
-        tol : float
-            the tolerance; positive and finite
-
-        Raises
-        ------
-        OpenMMException
-            if tol is not a positive finite number
-        """
-        super().setConstraintTolerance(number(tol, "tol"))
 
     def step(self, steps: int) -> None:
         """Advance the simulation by a number of steps.
@@ -913,113 +1080,6 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         """
         super().reverse()
 
-    def addConstraint(
-        self,
-        expression: str,
-        particles: Iterable[int],
-        parameters: Mapping[str, float | unit.Quantity] = {},
-    ) -> int:
-        """Add a constraint g = 0 to those of the System. g is an expression of the coordinates of some particles in nm,
-        which are called x1, y1, z1 for the first particle, x2, y2, z2 for the second, and so on; and of parameters
-        of this constraint, which have names.
-
-        It has the syntax of OpenMM's custom forces: operators + - * / ^, their functions, and intermediate values
-        defined after a semicolon. Derivatives are found symbolically. Constraints that have the same expression, with
-        different particles and values of parameters, are evaluated together, which is much faster.
-
-            integrator.addConstraint("r - r0; r = sqrt((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2)", [3, 7], {"r0": 0.3})
-
-        Functions for the constraints that are asked for most are in openmmvrattle.constraints.
-
-        The gradient of g must not vanish where g = 0: a point is kept on a sphere by r - r0 or by r^2 - r0^2, but
-        not by (r - r0)^2. Coordinates are taken as they are, not as their nearest periodic images. A particle of
-        mass zero is a fixed point; at least one of the particles must have mass, and none may be a virtual site.
-
-        As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at
-        the first step. OpenMM itself knows nothing of it: Context.applyConstraints() and
-        applyVelocityConstraints() leave it alone, and a CompoundIntegrator's other integrators do not keep it. It
-        works on the platforms Reference and CPU.
-
-        A constraint that is added after the Context was created takes effect with Context.reinitialize(); until
-        then steps raise an exception.
-
-        Parameters
-        ----------
-        expression : str
-            the expression g
-        particles : list
-            the indices of the particles
-        parameters : dict
-            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
-
-        Returns
-        -------
-        int
-            the index of the constraint among those that were added
-
-        Raises
-        ------
-        OpenMMException
-            if the expression cannot be understood, contains anything but coordinates of the particles and the
-            parameters, or a particle is named twice
-        """
-        return super().addConstraint(*constraint_arguments(expression, particles, parameters))
-
-    def getExpressionConstraintParameters(self, index: int) -> tuple[str, list[int], dict[str, float]]:
-        """Get what a constraint was added with.
-
-        Parameters
-        ----------
-        index : int
-            the index of the constraint
-
-        Returns
-        -------
-        tuple
-            the expression, the list of the particles, and the dict of the parameters, as numbers in OpenMM's units
-
-        Raises
-        ------
-        OpenMMException
-            if there is no constraint with this index
-        """
-        index = integer(index, "index")
-        expression, particles = self._getExpression(index), list(self._getExpressionParticles(index))
-        return expression, particles, dict(self._getExpressionParameters(index))
-
-    def setExpressionConstraintParameters(
-        self,
-        index: int,
-        expression: str,
-        particles: Iterable[int],
-        parameters: Mapping[str, float | unit.Quantity] = {},
-    ) -> None:
-        """Change a constraint.
-
-        New values of its parameters are met by the next step, which moves the particles there; see
-        setExpressionParameterValue(). Another expression, other particles or other names take effect with
-        Context.reinitialize(), as for addConstraint().
-
-        Parameters
-        ----------
-        index : int
-            the index of the constraint
-        expression : str
-            the expression
-        particles : list
-            the indices of the particles
-        parameters : dict
-            the values of the parameters by name: Quantities, or numbers (in nm, ps, amu, kJ/mol, radian)
-
-        Raises
-        ------
-        OpenMMException
-            if there is no constraint with this index, or addConstraint() would refuse it
-        """
-        super().setExpressionConstraintParameters(
-            integer(index, "index"), *constraint_arguments(expression, particles, parameters)
-        )
-
     @staticmethod
     def isinstance(integrator: openmm.Integrator) -> bool:
         """Get whether an integrator is a VariableStepRattleIntegrator, though its class may be openmm.Integrator.
@@ -1055,34 +1115,330 @@ class VariableStepRattleIntegrator(vrattle.VariableStepRattleIntegrator):
         TypeError
             if it is an integrator of another kind
         """
-        if isinstance(integrator, VariableStepRattleIntegrator):
-            return integrator
-        typed = vrattle.VariableStepRattleIntegrator._cast(integrator)
-        if typed is None:
-            raise TypeError(f"a {type(integrator).__name__} is not a VariableStepRattleIntegrator")
-        typed.thisown = integrator.thisown
-        integrator.thisown = False
-        integrator.this = typed.this
-        integrator.__class__ = VariableStepRattleIntegrator
-        return integrator
+        return _cast(integrator, VariableStepRattleIntegrator, vrattle.VariableStepRattleIntegrator)
 
-    def _attributes(self) -> dict[str, object]:
-        """Return what Python code has attached to this integrator."""
-        return {name: value for name, value in self.__dict__.items() if name != "this"}
 
-    def __copy__(self) -> VariableStepRattleIntegrator:
-        duplicate = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.clone(self))
-        duplicate.__class__ = type(self)
-        duplicate.__dict__.update(copy.deepcopy(self._attributes()))
-        return duplicate
+class VariableStepRattleLangevinIntegrator(ConstrainedIntegrator, vrattle.VariableStepRattleLangevinIntegrator):
+    """An integrator for Langevin dynamics, so at constant temperature, with constraints.
 
-    def __deepcopy__(self, memo: dict) -> VariableStepRattleIntegrator:
-        return self.__copy__()
+    It is used as OpenMM's LangevinMiddleIntegrator, samples what that one samples while all is calm, and goes through
+    clashes, bad starts and the one bad moment of a step that is otherwise not too large, where others end with
+    'Particle coordinate is NaN'.
 
-    def __getstate__(self) -> tuple[str, dict[str, object]]:
-        return openmm.XmlSerializer.serialize(self), self._attributes()
+    All steps have the size H = stepSize and count the same, so that averages and reporters need know nothing. A step is
+    g-BAOAB (B. Leimkuhler and C. Matthews, 'Efficient molecular dynamics using geodesic integration and solvent-solute
+    splitting', Proc. R. Soc. A 472, 2016) with one evaluation of the forces: half a kick, half a drift on the
+    constraints, friction and noise, half a drift, half a kick. When something is hard, and only then, it is made of n =
+    2^k + 1 reversible substeps of RATTLE of the size H/n, with friction and noise in the middle of the central one, and
+    the same noise whatever n is: n evaluations of the forces.
 
-    def __setstate__(self, state: tuple[str, dict[str, object]]) -> None:
-        xml, attributes = state
-        self.this = VariableStepRattleIntegrator.cast(openmm.XmlSerializer.deserialize(xml)).this
-        self.__dict__.update(attributes)
+    What is hard is measured by U = (sum_c A_c^4)^(1/8), A_c = sum_i (|f_i|^2/m_i + |f_i| |v_i|^2/l) over the particles
+    of a cluster c that constraints join, f being the net force, applied and of constraints, and l = 0.0125 nm. k is the
+    smallest number with 2^k >= (U/U_ref)^(2/3)/2.2, chosen at the beginning of a step and made larger if the end of the
+    step asks for it, or if its equations could not be solved. U_ref is a running median of U, which changes by 0.2 % a
+    step and is no less than sqrt(kT)/(2H): see setReferenceMonitorValue().
+
+    It is no minimiser: the heat of a clash is real, and leaves at the rate of the friction. And a calm system gains
+    nothing from it.
+
+    The velocities in the Context belong to the same time as the positions and satisfy the velocity constraints. A
+    vibration of frequency w has the variance kT (1 - (w H)^2/4) in them, so a temperature made by hand from
+    getVelocities() is lower than the one asked for, by 1.5 % for rigid water at 4 fs. The kinetic energy of a State,
+    and the temperature that OpenMM's reporters print, is that of the velocities half a substep before, which has no
+    such error.
+
+    The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly
+    coupled are met to the tolerance; and the multipliers, that is the constraint forces, can be read with
+    getMultipliers(). Constraints may also be given as expressions with addConstraint().
+
+    A step that cannot be completed with getMaximumSubsteps() substeps raises an OpenMMException and leaves the Context
+    in the state before that step.
+
+    OpenMM's XmlSerializer stores all settings; copies and pickles have the settings too, and no Context. Checkpoints
+    store the settings and everything else that the next step depends on, the random numbers to come and U_ref among
+    them: a run that goes on from one is the same to the last bit on the Reference platform. So do States made with
+    integratorParameters=True, but for the random seed: several runs that go on from one State each have the noise of
+    their own integrator.
+
+    OpenMM's own functions that return an integrator, openmm.XmlSerializer.deserialize() and
+    CompoundIntegrator.getIntegrator(), return one of ours as a bare openmm.Integrator; cast() makes it a
+    VariableStepRattleLangevinIntegrator, and openmmvrattle.XmlSerializer does so by itself.
+
+    Wrong values raise an openmm.OpenMMException; arguments of a wrong type or unit raise a TypeError.
+    """
+
+    def __init__(
+        self,
+        temperature: float | unit.Quantity,
+        frictionCoeff: float | unit.Quantity,
+        stepSize: float | unit.Quantity,
+        constraintTolerance: float | None = None,
+        randomNumberSeed: int | None = None,
+    ) -> None:
+        """Create a VariableStepRattleLangevinIntegrator.
+
+        Parameters
+        ----------
+        temperature : float or Quantity
+            the temperature of the heat bath (in K); not negative
+        frictionCoeff : float or Quantity
+            the friction coefficient that couples the system to it (in 1/ps); not negative. With 0 the dynamics is that
+            of constant energy
+        stepSize : float or Quantity
+            the size of a step (in ps). With 0 no step can be taken, which will do for a Context that computes energies
+        constraintTolerance : float
+            the relative tolerance of the constraints, see setConstraintTolerance(). Default: 1e-8
+        randomNumberSeed : int
+            the random number seed, see setRandomNumberSeed(). Default: 0, for another one in each Context
+        """
+        super().__init__(
+            number(temperature, "temperature", unit.kelvin),
+            number(frictionCoeff, "frictionCoeff", _FRICTION),
+            number(stepSize, "stepSize", _TIME),
+        )
+        if constraintTolerance is not None:
+            self.setConstraintTolerance(constraintTolerance)
+        if randomNumberSeed is not None:
+            self.setRandomNumberSeed(randomNumberSeed)
+
+    def getTemperature(self) -> unit.Quantity:
+        """Get the temperature of the heat bath.
+
+        Returns
+        -------
+        Quantity
+            the temperature in kelvins
+        """
+        return unit.Quantity(super().getTemperature(), unit.kelvin)
+
+    def setTemperature(self, temp: float | unit.Quantity) -> None:
+        """Set the temperature of the heat bath.
+
+        Parameters
+        ----------
+        temp : float or Quantity
+            the temperature of the heat bath (in K); not negative
+
+        Raises
+        ------
+        OpenMMException
+            if temp is negative or not finite
+        """
+        super().setTemperature(number(temp, "temp", unit.kelvin))
+
+    def getFriction(self) -> unit.Quantity:
+        """Get the friction coefficient that couples the system to the heat bath.
+
+        Returns
+        -------
+        Quantity
+            the friction coefficient in 1/picoseconds
+        """
+        return unit.Quantity(super().getFriction(), _FRICTION)
+
+    def setFriction(self, coeff: float | unit.Quantity) -> None:
+        """Set the friction coefficient that couples the system to the heat bath.
+
+        Parameters
+        ----------
+        coeff : float or Quantity
+            the friction coefficient (in 1/ps); not negative
+
+        Raises
+        ------
+        OpenMMException
+            if coeff is negative or not finite
+        """
+        super().setFriction(number(coeff, "coeff", _FRICTION))
+
+    def getRandomNumberSeed(self) -> int:
+        """Get the random number seed, as it was set. See setRandomNumberSeed() for details.
+
+        Returns
+        -------
+        int
+            the seed
+        """
+        return super().getRandomNumberSeed()
+
+    def setRandomNumberSeed(self, seed: int) -> None:
+        """Set the random number seed.
+
+        Two runs with the same seed that start alike have the same noise; with different seeds it is independent. With
+        0, the default, each Context has a seed of its own. The noise of a particle is a function of the seed, the
+        number of steps that were taken since it came into force, and the index of the particle.
+
+        Parameters
+        ----------
+        seed : int
+            the seed
+        """
+        super().setRandomNumberSeed(integer(seed, "seed"))
+
+    def setStepSize(self, size: float | unit.Quantity) -> None:
+        """Set the size of a step, whatever number of substeps it is made of.
+
+        Parameters
+        ----------
+        size : float or Quantity
+            the step size (in ps); 0 where no step is to be taken
+
+        Raises
+        ------
+        OpenMMException
+            if size is negative or not finite
+        """
+        super().setStepSize(number(size, "size", _TIME))
+
+    def getMaximumSubsteps(self) -> int:
+        """Get the most substeps that a step may be made of.
+
+        Returns
+        -------
+        int
+            the number of substeps
+        """
+        return super().getMaximumSubsteps()
+
+    def setMaximumSubsteps(self, substeps: int) -> None:
+        """Set the most substeps that a step may be made of: 2^k + 1, with k up to 20; or 1, so that no step has any.
+
+        A step that asks for more is tried with that many, and accepted if all numbers are finite. Default: 1025
+
+        Parameters
+        ----------
+        substeps : int
+            the number of substeps: 1, 3, 5, 9, 17, ...
+
+        Raises
+        ------
+        OpenMMException
+            if it is none of these numbers
+        """
+        super().setMaximumSubsteps(integer(substeps, "substeps"))
+
+    def getNumSubstepped(self) -> int:
+        """Get how many steps have been made of substeps since the Context was created.
+
+        Returns
+        -------
+        int
+            the number of steps
+        """
+        return super().getNumSubstepped()
+
+    def getLargestSubsteps(self) -> int:
+        """Get the largest number of substeps that a step has been made of since the Context was created.
+
+        Returns
+        -------
+        int
+            the number of substeps; 1 if no step had any
+        """
+        return super().getLargestSubsteps()
+
+    def getReferenceMonitorValue(self) -> float:
+        """Get the reference value U_ref of the monitor.
+
+        Returns
+        -------
+        float
+            the value in force, in nm amu^(1/2)/ps^2; 0 if none was set and no step has been taken that could tell
+        """
+        return super().getReferenceMonitorValue()
+
+    def setReferenceMonitorValue(self, value: float) -> None:
+        """Set the reference value U_ref of the monitor, which then stays what it is.
+
+        With 0, the default, it follows the run, as a running median: by 0.2 % a step up where U is larger, and down
+        where it is smaller, but no lower than sqrt(kT)/(2H), with the kT of 10 K below that temperature. It begins as U
+        at the first step, or four times that bound if that is less.
+
+        Parameters
+        ----------
+        value : float
+            the reference value (in nm/ps^2 amu^(1/2)), or 0
+
+        Raises
+        ------
+        OpenMMException
+            if value is negative or not finite
+        """
+        super().setReferenceMonitorValue(number(value, "value"))
+
+    def freezeReference(self, frozen: bool) -> None:
+        """Set whether U_ref stays what it is at the moment. Then the number of substeps depends on the state alone.
+
+        Parameters
+        ----------
+        frozen : bool
+            whether it stays; if not, it follows the run, unless a value was set. Default: False
+        """
+        if frozen not in (True, False):
+            raise TypeError(f"frozen must be True or False, not {frozen!r}")
+        super().freezeReference(bool(frozen))
+
+    def isReferenceFrozen(self) -> bool:
+        """Get whether freezeReference() has been called to keep U_ref.
+
+        Returns
+        -------
+        bool
+            whether it stays what it is
+        """
+        return super().isReferenceFrozen()
+
+    def getMonitorValue(self) -> float:
+        """Get the value U(q,p) of the monitor at the current positions and velocities.
+
+        Before the first step this computes the forces.
+
+        Returns
+        -------
+        float
+            the value in nm amu^(1/2)/ps^2
+
+        Raises
+        ------
+        OpenMMException
+            if there is no Context
+        """
+        return super().getMonitorValue()
+
+    @staticmethod
+    def isinstance(integrator: openmm.Integrator) -> bool:
+        """Get whether an integrator is a VariableStepRattleLangevinIntegrator, though its class may be
+        openmm.Integrator.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            any integrator
+
+        Returns
+        -------
+        bool
+            whether cast() would take it
+        """
+        return vrattle.VariableStepRattleLangevinIntegrator._isinstance(integrator)
+
+    @staticmethod
+    def cast(integrator: openmm.Integrator) -> VariableStepRattleLangevinIntegrator:
+        """Make what OpenMM has returned as a bare openmm.Integrator a VariableStepRattleLangevinIntegrator again.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
+
+        Returns
+        -------
+        VariableStepRattleLangevinIntegrator
+            the same Python object, whose class has been changed
+
+        Raises
+        ------
+        TypeError
+            if it is an integrator of another kind
+        """
+        return _cast(integrator, VariableStepRattleLangevinIntegrator, vrattle.VariableStepRattleLangevinIntegrator)

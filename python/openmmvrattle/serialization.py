@@ -34,7 +34,9 @@ def with_class(result: object) -> object:
     """What OpenMM has returned, of our own class if it is one of our integrators."""
     # The compiled class exists only where it could be loaded.
     compiled = sys.modules.get(f"{__package__}.integrators")
-    classes = [CustomVariableStepRattleIntegrator] + ([compiled.VariableStepRattleIntegrator] if compiled else [])
+    classes = [CustomVariableStepRattleIntegrator]
+    if compiled:
+        classes += [compiled.VariableStepRattleIntegrator, compiled.VariableStepRattleLangevinIntegrator]
     for each in classes:
         if isinstance(result, openmm.Integrator) and each.isinstance(result):
             return each.cast(result)

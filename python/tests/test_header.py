@@ -1,6 +1,6 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""The class that Python users see has the methods, arguments, defaults and units that the C++ header says."""
+"""The classes that Python users see have the methods, arguments, defaults and units that the C++ headers say."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
+from openmmvrattle.integrators import ConstrainedIntegrator
 
-HEADER = Path(__file__).parents[2] / "openmmapi" / "include" / "openmmvrattle" / "VariableStepRattleIntegrator.h"
+HEADERS = Path(__file__).parents[2] / "openmmapi" / "include" / "openmmvrattle"
+CLASSES = [ConstrainedIntegrator, VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator]
 INHERITED = {"getIntegrationForceGroups", "setIntegrationForceGroups"}
 """What Python has from openmm.Integrator, whose methods take sets of groups too and call ours."""
 PYTHON_ONLY = {"cast", "isinstance"}
+PYTHON_REPEATS = {"step"}
+"""What Python's classes add something to, though C++ has it from the base."""
 
 
 @dataclass
@@ -42,10 +46,10 @@ class Function:
         return "" if found is None else " ".join(found[1].split())
 
 
-def functions() -> dict[str, Function]:
-    """The public functions of the class, constructor and destructor left out."""
-    text = HEADER.read_text(encoding="utf-8")
-    public = text[text.index("public:") : text.index("protected:")]
+def functions(name: str) -> dict[str, Function]:
+    """The public functions of a class, constructor and destructor left out."""
+    text = (HEADERS / f"{name}.h").read_text(encoding="utf-8")
+    public = re.split("protected:|private:", text[text.index("public:") :])[0]
     comment = r"/\*\*(?P<comment>(?:(?!\*/).)*)\*/\s*"
     declaration = r"^ *[\w:<> ]+[ &](?P<name>[a-z]\w*)\((?P<arguments>[^;]*?)\)[\w ]*;"
     result = {}
@@ -64,7 +68,11 @@ def functions() -> dict[str, Function]:
     return result
 
 
-FUNCTIONS = functions() if HEADER.exists() else {}
+FUNCTIONS_OF = {each: functions(each.__name__) for each in CLASSES} if HEADERS.exists() else {}
+FUNCTIONS = {name: f for each in CLASSES[:2] for name, f in FUNCTIONS_OF.get(each, {}).items()}
+CASES = [
+    (each, name) for each, functions_of_it in FUNCTIONS_OF.items() for name in sorted(set(functions_of_it) - INHERITED)
+]
 pytestmark = pytest.mark.skipif(not FUNCTIONS, reason="needs the folder openmmapi")
 
 
@@ -76,18 +84,19 @@ def test_the_header_is_read() -> None:
     assert FUNCTIONS["stepTo"].explanation("time").endswith(", in ps")
 
 
-def test_python_has_the_methods_of_the_header() -> None:
+@pytest.mark.parametrize("integrator", CLASSES)
+def test_python_has_the_methods_of_the_header(integrator: type) -> None:
     own = {
         name
-        for name, member in vars(VariableStepRattleIntegrator).items()
+        for name, member in vars(integrator).items()
         if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, staticmethod))
     }
-    assert own - PYTHON_ONLY == set(FUNCTIONS) - INHERITED
+    assert own - PYTHON_ONLY - PYTHON_REPEATS == set(FUNCTIONS_OF[integrator]) - INHERITED - PYTHON_REPEATS
 
 
-@pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - INHERITED))
-def test_arguments_defaults_and_units_are_those_of_the_header(name: str) -> None:
-    function, method = FUNCTIONS[name], getattr(VariableStepRattleIntegrator, name)
+@pytest.mark.parametrize(("integrator", "name"), CASES)
+def test_arguments_defaults_and_units_are_those_of_the_header(integrator: type, name: str) -> None:
+    function, method = FUNCTIONS_OF[integrator][name], getattr(integrator, name)
     signature = inspect.signature(method)
     parameters = {key: value for key, value in signature.parameters.items() if key != "self"}
     assert list(parameters) == list(function.arguments)

@@ -15,6 +15,7 @@ import openmm
 import pytest
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.integrators import ConstrainedIntegrator
 
 pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
 
@@ -38,7 +39,8 @@ MONITOR_KINDS = {
 }
 PUBLIC_METHODS = [
     name
-    for name, member in vars(VariableStepRattleIntegrator).items()
+    for each in (ConstrainedIntegrator, VariableStepRattleIntegrator)
+    for name, member in vars(each).items()
     if inspect.isfunction(member) and not name.startswith("_")
 ]
 

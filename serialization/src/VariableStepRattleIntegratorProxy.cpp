@@ -2,14 +2,15 @@
 // SPDX-License-Identifier: MIT
 
 #include "openmmvrattle/VariableStepRattleIntegratorProxy.h"
+#include "ExpressionConstraintNodes.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
+#include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
+#include "openmmvrattle/VariableStepRattleLangevinIntegratorProxy.h"
 #include "run/IntegratorSettings.h"
-#include <map>
 #include <memory>
 #include <string>
-#include <vector>
 
 using namespace OpenMMVRattle;
 using OpenMM::OpenMMException;
@@ -21,35 +22,8 @@ namespace {
 const int VERSION =
     3; // 2: automatic step control, constraints by expressions; 3: default monitor, order of each monitor
 const char MINIMUM_STEP[] = "minimumStepSize", MAXIMUM_STEP[] = "maximumStepSize";
-const char AUTOMATIC_CONTROL[] = "AutomaticStepControl", EXPRESSION_CONSTRAINTS[] = "ExpressionConstraints";
+const char AUTOMATIC_CONTROL[] = "AutomaticStepControl";
 const char* const AUTOMATIC_REFERENCES[] = {"onStepReference", "halfStepReference"};
-
-void writeExpressionConstraints(const IntegratorSettings& settings, SerializationNode& node) {
-    for (const ExpressionConstraint& each : settings.expressions) {
-        SerializationNode& constraint = node.createChildNode("Constraint");
-        constraint.setStringProperty("expression", each.expression);
-        for (int particle : each.particles)
-            constraint.createChildNode("Particle").setIntProperty("index", particle);
-        for (const auto& parameter : each.parameters)
-            constraint.createChildNode("Parameter")
-                .setStringProperty("name", parameter.first)
-                .setDoubleProperty("value", parameter.second);
-    }
-}
-
-void readExpressionConstraints(const SerializationNode& node, VariableStepRattleIntegrator& integrator) {
-    for (const SerializationNode& constraint : node.getChildren()) {
-        std::vector<int> particles;
-        std::map<std::string, double> parameters;
-        for (const SerializationNode& child : constraint.getChildren()) {
-            if (child.getName() == "Particle")
-                particles.push_back(child.getIntProperty("index"));
-            else
-                parameters[child.getStringProperty("name")] = child.getDoubleProperty("value");
-        }
-        integrator.addConstraint(constraint.getStringProperty("expression"), particles, parameters);
-    }
-}
 
 } // namespace
 
@@ -85,8 +59,7 @@ void VariableStepRattleIntegratorProxy::serialize(const void* object, Serializat
         for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
             automatic.setDoubleProperty(AUTOMATIC_REFERENCES[k], settings.automaticReferences[k]);
     }
-    if (!settings.expressions.empty())
-        writeExpressionConstraints(settings, node.createChildNode(EXPRESSION_CONSTRAINTS));
+    writeExpressionConstraints(settings.expressions, node);
 }
 
 // Through the integrator's functions, which refuse what is wrong.
@@ -124,14 +97,15 @@ void* VariableStepRattleIntegratorProxy::deserialize(const SerializationNode& no
             for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
                 integrator->setReferenceMonitorValue(child.getDoubleProperty(AUTOMATIC_REFERENCES[k]), k);
         }
-        else if (child.getName() == EXPRESSION_CONSTRAINTS)
-            readExpressionConstraints(child, *integrator);
     }
+    readExpressionConstraints(node, *integrator);
     return integrator.release();
 }
 
 void registerVRattleSerializationProxies() {
     SerializationProxy::registerProxy(typeid(VariableStepRattleIntegrator), new VariableStepRattleIntegratorProxy());
+    SerializationProxy::registerProxy(typeid(VariableStepRattleLangevinIntegrator),
+                                      new VariableStepRattleLangevinIntegratorProxy());
 }
 
 namespace {

@@ -41,7 +41,7 @@ private:
 
 CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                  const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
-        HostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
+        HostVRattleDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
         state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true), areSettingsOnDevice(false),
         hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK), lastMaxTime(NO_LIMIT), settledTime(0),
         settledCount(0), knownCount(0), groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true),
@@ -83,9 +83,9 @@ void CommonRunDevice::ensureForces() {
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
 bool CommonRunDevice::canStepOnDevice() {
-    if (steps == nullptr || settings.isAutomatic || ahead != nullptr || !dynamics->hasStarted())
+    if (steps == nullptr || settings.isAutomatic || ahead != nullptr || !vrattle.hasStarted())
         return false;
-    const vector<double> references = dynamics->getReferences();
+    const vector<double> references = vrattle.getReferences();
     return std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
 }
 
@@ -94,7 +94,7 @@ void CommonRunDevice::beginOnDevice() {
     ensureForces();
     if (!areSettingsOnDevice) {
         vector<StepMonitor::Term> terms = settings.terms;
-        const vector<double> references = dynamics->getReferences();
+        const vector<double> references = vrattle.getReferences();
         for (size_t k = 0; k < terms.size(); k++)
             terms[k].reference = references[k];
         steps->setSettings({settings.stepSize,
@@ -112,8 +112,8 @@ void CommonRunDevice::bringToHost() {
     if (isOnHost)
         return;
     ensureForces();
-    dynamics->adopt(vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy, state.density,
-                    state.hasHalfStepValue ? &state.halfStepValue : nullptr, state.densityOffset);
+    vrattle.adopt(vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy, state.density,
+                  state.hasHalfStepValue ? &state.halfStepValue : nullptr, state.densityOffset);
     isOnHost = true;
 }
 
@@ -129,8 +129,8 @@ void CommonRunDevice::step(double maxTime) {
     if (maxTime < NO_LIMIT)
         settle();
     if (!isOnDevice && canStepOnDevice()) {
-        const double halfStepValue = dynamics->findHalfStepValue();
-        const VRattleDynamics::Memory memory = dynamics->getMemory();
+        const double halfStepValue = vrattle.findHalfStepValue();
+        const VRattleDynamics::Memory memory = vrattle.getMemory();
         state = {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
         isOnDevice = true;
         hasBegun = false;
@@ -255,7 +255,7 @@ bool CommonRunDevice::updateState() {
 }
 
 RunDevice::Change CommonRunDevice::findChange() {
-    if (ahead != nullptr || dynamics->getPositions().empty())
+    if (ahead != nullptr || vrattle.getPositions().empty())
         return HostRunDevice::findChange();
     const OpenMM::Vec3* box = vectors->getBoxVectors();
     const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
@@ -347,7 +347,7 @@ void CommonRunDevice::reverse() {
 
 void CommonRunDevice::beginTrial(double stepSize, bool isBackwards) {
     takeToHost();
-    HostRunDevice::beginTrial(stepSize, isBackwards);
+    HostVRattleDevice::beginTrial(stepSize, isBackwards);
 }
 
 // ------------------------------------------------------------------------------------------------------------- numbers
@@ -372,7 +372,7 @@ vector<double> CommonRunDevice::getMonitorValues() {
         return lastReport.values;
     }
     bringToHost();
-    return HostRunDevice::getMonitorValues();
+    return HostVRattleDevice::getMonitorValues();
 }
 
 vector<double> CommonRunDevice::getMultipliers() {
@@ -393,7 +393,7 @@ long long CommonRunDevice::getNumSolverIterations() {
 
 long long CommonRunDevice::getNumRescues() {
     settle();
-    return HostRunDevice::getNumRescues() + numDeviceRescues;
+    return HostVRattleDevice::getNumRescues() + numDeviceRescues;
 }
 
 void CommonRunDevice::save(RunState& run) {

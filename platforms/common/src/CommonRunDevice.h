@@ -5,7 +5,7 @@
 #define OPENMMVRATTLE_COMMONRUNDEVICE_H_
 
 #include "DeviceSteps.h"
-#include "HostRunDevice.h"
+#include "HostVRattleDevice.h"
 #include <memory>
 
 namespace OpenMMVRattle {
@@ -16,7 +16,7 @@ namespace OpenMMVRattle {
  * could not complete, trial runs, turning around, saving. The two hand the state over to each other. What the GPU cannot do is
  * done on the host throughout: automatic step control, and constraints for which there are no kernels.
  */
-class CommonRunDevice : public HostRunDevice {
+class CommonRunDevice : public HostVRattleDevice {
 public:
     CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
                     const IntegratorSettings& settings);

@@ -5,10 +5,12 @@
 #define OPENMMVRATTLE_COMMONVRATTLEKERNELFACTORY_H_
 
 #include "CommonRunDevice.h"
+#include "ComputeVectors.h"
 #include "openmm/KernelFactory.h"
 #include "openmm/OpenMMException.h"
 #include "openmmvrattle/VRattleKernels.h"
 #include "openmmvrattle/windowsExportVRattle.h"
+#include "run/IntegratorSettings.h"
 #include <memory>
 #include <string>
 
@@ -23,13 +25,18 @@ public:
     }
     RunDevice& initialize(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
                           const IntegratorSettings& settings) override {
-        device = std::make_unique<CommonRunDevice>(context, compute, integrator, settings);
+        if (settings.langevin) { // whose steps are taken on the host, with forces from the GPU
+            compute.initializeContexts();
+            device = makeHostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings);
+        }
+        else
+            device = std::make_unique<CommonRunDevice>(context, compute, integrator, settings);
         return *device;
     }
 
 private:
     OpenMM::ComputeContext& compute;
-    std::unique_ptr<CommonRunDevice> device;
+    std::unique_ptr<HostRunDevice> device;
 };
 
 /**

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: MIT
 
 #include "HostRunDevice.h"
+#include "HostLangevinDevice.h"
+#include "HostVRattleDevice.h"
 #include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
@@ -57,10 +59,19 @@ bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
 
 } // namespace
 
+std::unique_ptr<HostRunDevice> OpenMMVRattle::makeHostRunDevice(ContextImpl& context,
+                                                                std::unique_ptr<ContextVectors> vectors,
+                                                                const OpenMM::Integrator& integrator,
+                                                                const IntegratorSettings& settings) {
+    if (settings.langevin)
+        return std::make_unique<HostLangevinDevice>(context, std::move(vectors), integrator, settings);
+    return std::make_unique<HostVRattleDevice>(context, std::move(vectors), integrator, settings);
+}
+
 HostRunDevice::HostRunDevice(ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
                              const OpenMM::Integrator& integrator, const IntegratorSettings& integratorSettings) :
         context(context), vectors(std::move(vectors)), integrator(integrator),
-        expressions(integratorSettings.expressions), settings(), forceGroups(0), monitorForceGroup(NO_MONITOR_GROUP),
+        expressions(integratorSettings.expressions), forceGroups(0), monitorForceGroup(NO_MONITOR_GROUP),
         lastStep{0.0, 1.0}, numForceEvaluations(0) {
     const System& system = context.getSystem();
     masses.resize(system.getNumParticles());
@@ -70,34 +81,24 @@ HostRunDevice::HostRunDevice(ContextImpl& context, std::unique_ptr<ContextVector
     for (int i = 0; i < system.getNumParticles(); i++)
         isVirtualSite[i] = system.isVirtualSite(i);
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
+    for (int i = 0; i < system.getNumForces(); i++)
+        reach.add(system.getForce(i));
+}
+
+vector<DistanceConstraint> HostRunDevice::getConstraints() const {
+    const System& system = context.getSystem();
     vector<DistanceConstraint> constraints(system.getNumConstraints());
     for (int i = 0; i < system.getNumConstraints(); i++) {
         DistanceConstraint& c = constraints[i];
         system.getConstraintParameters(i, c.particle1, c.particle2, c.length);
     }
-    for (int i = 0; i < system.getNumForces(); i++)
-        reach.add(system.getForce(i));
-    dynamics = std::make_unique<VRattleDynamics>(masses, constraints, expressions);
+    return constraints;
 }
 
 // -------------------------------------------------------------------------------------------------------- the settings
 
 void HostRunDevice::setSettings(const IntegratorSettings& from) {
-    VRattleDynamics::Settings to;
-    to.stepSize = from.stepSize;
-    to.minimumStep = from.stepSize > 0 ? from.getMinimumStep() : 0.0;
-    to.maximumStep = from.stepSize > 0 ? from.getMaximumStep() : 0.0;
-    to.tolerance = from.constraintTolerance;
-    to.update = from.update;
-    to.terms = from.monitors;
-    to.isFixedStep = false;
-    to.isAutomatic = from.isAutomatic;
-    to.automaticRequest = from.automaticRequest;
-    to.calibrationSteps = from.calibrationSteps;
-    if (from.isAutomatic)
-        std::copy(std::begin(from.automaticReferences), std::end(from.automaticReferences), to.automaticReferences);
-    dynamics->setSettings(to);
-    settings = to;
+    setDynamics(from);
     forceGroups = from.getActingForceGroups();
     monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : NO_MONITOR_GROUP;
     for (size_t i = 0; i < expressions.size(); i++)
@@ -164,7 +165,7 @@ void HostRunDevice::start() {
     const Vec3* box = vectors->getBoxVectors();
     const bool hasBox = hasPeriodicBox(context.getSystem(), box);
     const Vectors before = vectors->getPositions();
-    const VRattleDynamics::Kept kept = dynamics->keep();
+    const std::function<void()> putBackDynamics = dynamics->remember();
     try {
         dynamics->adoptParameters();
         requireSoundStart(dynamics->getConstraintSystem(),
@@ -179,7 +180,7 @@ void HostRunDevice::start() {
     }
     catch (...) {
         vectors->setPositions(before);
-        dynamics->putBack(kept);
+        putBackDynamics();
         throw;
     }
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
@@ -360,54 +361,7 @@ long long HostRunDevice::getStepCount() {
     return vectors->getStepCount();
 }
 
-// ---------------------------------------------------------------------------------------------------------- trial runs
-
-void HostRunDevice::beginTrial(double stepSize, bool isBackwards) {
-    const double direction = isBackwards ? -1 : 1;
-    trial.reset(new Trial{dynamics->keep(), vectors->getTime(), direction});
-    VRattleDynamics::Settings fixed = settings;
-    fixed.isFixedStep = true;
-    fixed.stepSize = stepSize;
-    Vectors velocities = dynamics->getVelocities();
-    for (Vec3& v : velocities)
-        v *= direction;
-    try {
-        dynamics->setSettings(fixed);
-        dynamics->begin(trial->kept.positions, velocities, trial->kept.forces, trial->kept.groupEnergy);
-    }
-    catch (...) {
-        endTrial();
-        throw;
-    }
-}
-
-void HostRunDevice::takeTrialStep() {
-    try {
-        advance(std::numeric_limits<double>::infinity(), trial->direction);
-    }
-    catch (...) {
-        endTrial();
-        throw;
-    }
-}
-
-void HostRunDevice::endTrial() {
-    if (trial == nullptr)
-        return;
-    dynamics->putBack(trial->kept);
-    vectors->setTime(trial->time);
-    trial.reset();
-    putBack();
-}
-
 // ------------------------------------------------------------------------------------------------------------- numbers
-
-vector<double> HostRunDevice::getMonitorValues() {
-    if (!settings.isAutomatic)
-        return dynamics->getMonitorValues();
-    const AutomaticControl::Memory& memory = dynamics->getAutomaticControl().getMemory();
-    return {std::begin(memory.values), std::end(memory.values)};
-}
 
 vector<double> HostRunDevice::getMultipliers() {
     vector<double> result;
@@ -431,45 +385,10 @@ long long HostRunDevice::getNumSolverIterations() {
     return dynamics->getNumIterations();
 }
 
-long long HostRunDevice::getNumRescues() {
-    return dynamics->getNumRescues();
-}
-
-double HostRunDevice::getNegligibleValue() {
-    return dynamics->getAutomaticControl().getNegligibleValue();
-}
-
-long long HostRunDevice::getNumShortSteps() {
-    return (long long) dynamics->getAutomaticControl().getMemory().mostShortSteps;
-}
-
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
 void HostRunDevice::save(RunState& run) {
-    const VRattleDynamics::Memory memory = dynamics->getMemory();
-    run.halfStepVelocities = memory.halfStepVelocities;
-    run.methodValues = {{"hasDensity", {(double) memory.hasDensity}},
-                        {"density", {memory.density}},
-                        {"parameters", memory.parameters},
-                        {"parameterRates", memory.parameterRates},
-                        {"multiplierOffset", memory.multiplierOffset},
-                        {"multipliers", memory.multipliers},
-                        {"monitorValues", memory.monitorValues},
-                        {"hasHalfStepValue", {(double) memory.hasHalfStepValue}},
-                        {"u", {memory.u}},
-                        {"halfStepValue", {memory.halfStepValue}},
-                        {"rate", {memory.rate}},
-                        {"densityOffset", {memory.densityOffset}}};
-    if (settings.isAutomatic) {
-        const AutomaticControl::Memory& control = memory.automatic;
-        run.methodValues["automaticBehind"] = {std::begin(control.behind), std::end(control.behind)};
-        run.methodValues["automaticAhead"] = {std::begin(control.ahead), std::end(control.ahead)};
-        run.methodValues["automaticValues"] = {std::begin(control.values), std::end(control.values)};
-        run.methodValues["automaticForceSquares"] = control.forceSquares;
-        run.methodValues["automaticLearning"] = {control.stepsSinceStart, control.numLearnt,   control.logarithms[0],
-                                                 control.logarithms[1],   control.temperature, control.following};
-        run.methodValues["automaticShortSteps"] = {control.shortSteps, control.mostShortSteps};
-    }
+    saveDynamics(run);
     run.forces = dynamics->getForces();
     run.groupEnergy = dynamics->getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
@@ -484,49 +403,6 @@ void HostRunDevice::save(RunState& run) {
         run.contextVelocities = ahead->velocities;
 }
 
-VRattleDynamics::Memory HostRunDevice::memoryOf(const RunState& run, const IntegratorSettings& saved) const {
-    const ConstraintSystem& system = dynamics->getConstraintSystem();
-    const size_t numConstraints = system.getNumConstraints(), numParameters = system.getNumParameters();
-    VRattleDynamics::Memory memory = {};
-    memory.hasDensity = run.getMethodValue("hasDensity") != 0;
-    memory.density = run.getMethodValue("density");
-    memory.halfStepVelocities = run.halfStepVelocities;
-    memory.parameters = run.getMethodValues("parameters", numParameters);
-    memory.parameterRates = run.getMethodValues("parameterRates", numParameters);
-    memory.multiplierOffset = run.getMethodValues("multiplierOffset", numConstraints);
-    memory.references = run.references;
-    memory.multipliers = run.getMethodValues("multipliers", numConstraints);
-    memory.monitorValues = run.getMethodValues("monitorValues", saved.monitors.size());
-    memory.hasHalfStepValue = run.getMethodValue("hasHalfStepValue") != 0;
-    memory.u = run.getMethodValue("u");
-    memory.halfStepValue = run.getMethodValue("halfStepValue");
-    memory.rate = run.getMethodValue("rate");
-    memory.densityOffset = run.getMethodValue("densityOffset");
-    if (saved.isAutomatic) {
-        const size_t numMonitors = AutomaticControl::NUM_MONITORS;
-        AutomaticControl::Memory& control = memory.automatic;
-        std::copy_n(run.getMethodValues("automaticBehind", numMonitors).begin(), numMonitors, control.behind);
-        std::copy_n(run.getMethodValues("automaticAhead", numMonitors).begin(), numMonitors, control.ahead);
-        std::copy_n(run.getMethodValues("automaticValues", numMonitors).begin(), numMonitors, control.values);
-        control.forceSquares = run.getMethodValues("automaticForceSquares",
-                                                   dynamics->getAutomaticControl().getMemory().forceSquares.size());
-        const vector<double>& learning = run.getMethodValues("automaticLearning", 6);
-        control.stepsSinceStart = learning[0];
-        control.numLearnt = learning[1];
-        std::copy_n(&learning[2], numMonitors, control.logarithms);
-        control.temperature = learning[4];
-        control.following = learning[5];
-        control.shortSteps = run.getMethodValues("automaticShortSteps", 2)[0];
-        control.mostShortSteps = run.getMethodValues("automaticShortSteps", 2)[1];
-    }
-    return memory;
-}
-
-bool HostRunDevice::canResume(const RunState& run, const IntegratorSettings& saved) {
-    memoryOf(run, saved);
-    return true;
-}
-
 bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     const Vectors& positions = run.positions.empty() ? vectors->getPositions() : run.positions;
     const Vectors& velocities = run.velocities.empty() ? vectors->getVelocities() : run.velocities;
@@ -537,7 +413,7 @@ bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved,
     const double larger = std::max(std::fabs(energy), std::fabs(run.groupEnergy));
     if (!agree(forces, run.forces) || !(std::fabs(energy - run.groupEnergy) <= FORCE_ROUNDING * larger))
         return false;
-    dynamics->resume(positions, velocities, forces, energy, memoryOf(run, saved));
+    resumeDynamics({positions, velocities, forces, energy}, run, saved);
     ahead.reset();
     if (run.isContextAhead)
         ahead.reset(new Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,

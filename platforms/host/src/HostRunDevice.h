@@ -9,22 +9,23 @@
 #include "openmm/Integrator.h"
 #include "openmm/internal/ContextImpl.h"
 #include "run/RunDevice.h"
-#include "step/VRattleDynamics.h"
+#include "step/Dynamics.h"
 #include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * A device that computes on the host: it moves data between the vectors of a Context and VRattleDynamics, and asks for the forces.
- * All there is to Reference and the platforms derived from it; on a GPU it does what is rare, such as starts.
+ * A device that computes on the host: it moves data between the vectors of a Context and a method of integration (Dynamics), and
+ * asks for the forces. What is particular to a method is in the classes derived from this one, which are all there is to Reference and
+ * the platforms derived from it; on a GPU they do what is rare, such as starts.
  */
 class HostRunDevice : public RunDevice {
 public:
     HostRunDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
                   const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
-    /** Let threads share the work; see VRattleDynamics::setParallel(). */
-    void setParallel(const VRattleDynamics::Parallel& parallel, int numThreads) {
+    /** Let threads share the work; see Dynamics::setParallel(). */
+    void setParallel(const Dynamics::Parallel& parallel, int numThreads) {
         dynamics->setParallel(parallel, numThreads);
     }
     void setSettings(const IntegratorSettings& settings) override;
@@ -45,28 +46,32 @@ public:
     LastStep getLastStep() override;
     double getTime() override;
     long long getStepCount() override;
-    void beginTrial(double stepSize, bool isBackwards) override;
-    void takeTrialStep() override;
-    void endTrial() override;
-    std::vector<double> getMonitorValues() override;
     std::vector<double> getMultipliers() override;
     double computeKineticEnergy() override;
     long long getNumForceEvaluations() override;
     long long getNumSolverIterations() override;
-    long long getNumRescues() override;
-    double getNegligibleValue() override;
-    long long getNumShortSteps() override;
     void save(RunState& run) override;
-    bool canResume(const RunState& run, const IntegratorSettings& saved) override;
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
     typedef std::vector<OpenMM::Vec3> Vectors;
+    /** An on-step state that satisfies the constraints. */
+    struct State {
+        const Vectors &positions, &velocities, &forces;
+        double groupEnergy;
+    };
+    /** Give the method its settings, but for the parameters of expressions. */
+    virtual void setDynamics(const IntegratorSettings& settings) = 0;
+    /** Write down what the method goes on with beside the state. */
+    virtual void saveDynamics(RunState& run) = 0;
+    /** Let the method go on from a saved run. */
+    virtual void resumeDynamics(const State& state, const RunState& run, const IntegratorSettings& saved) = 0;
+    /** Those of the System. */
+    std::vector<DistanceConstraint> getConstraints() const;
     /** The Context, where it is not in the method's state: as the user or a Force has left it, until a step is complete. */
     struct Ahead {
         Vectors positions, velocities;
     };
-    VRattleDynamics::Memory memoryOf(const RunState& run, const IntegratorSettings& saved) const;
     /** Compute the forces at the Context's positions; returns the energy of the monitor's group there. */
     virtual double computeForces();
     double computeForcesAt(const Vectors& positions, Vectors& forces);
@@ -84,8 +89,7 @@ protected:
     std::vector<double> masses;
     std::vector<char> isVirtualSite;
     std::vector<ExpressionConstraint> expressions;
-    std::unique_ptr<VRattleDynamics> dynamics;
-    VRattleDynamics::Settings settings;
+    std::unique_ptr<Dynamics> dynamics; // which the derived class makes
     int forceGroups, monitorForceGroup;
     bool hasMassless;
     ForceReach reach;
@@ -93,13 +97,12 @@ protected:
     OpenMM::Vec3 boxVectors[3]; // when they were last looked at
     LastStep lastStep;
     long long numForceEvaluations;
-    /** A trial run, and what is to be put back after it. */
-    struct Trial {
-        VRattleDynamics::Kept kept;
-        double time, direction;
-    };
-    std::unique_ptr<Trial> trial;
 };
+
+/** The device for the method that the settings ask for. */
+std::unique_ptr<HostRunDevice> makeHostRunDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
+                                                 const OpenMM::Integrator& integrator,
+                                                 const IntegratorSettings& settings);
 
 } // namespace OpenMMVRattle
 

@@ -21,8 +21,7 @@ public:
     }
     RunDevice& initialize(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
                           const IntegratorSettings& settings) override {
-        device =
-            std::make_unique<HostRunDevice>(context, std::make_unique<ReferenceVectors>(data), integrator, settings);
+        device = makeHostRunDevice(context, std::make_unique<ReferenceVectors>(data), integrator, settings);
         if (getPlatform().getName() != "Reference") { // which does everything on one thread
             // This thread is awake and takes the share of the pool's first.
             auto runOnThreads = [this](const std::function<void(int)>& task) {

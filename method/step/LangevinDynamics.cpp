@@ -1,0 +1,439 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "step/LangevinDynamics.h"
+#include "constraints/StepFailure.h"
+#include "openmm/internal/OSRngSeed.h"
+#include "step/RandomNumbers.h"
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <sstream>
+#include <string>
+
+using namespace OpenMMVRattle;
+using OpenMM::Vec3;
+using std::vector;
+
+namespace {
+
+const double BOLTZMANN = 0.00831446261815324; // kJ/mol/K
+
+// The monitor's length l (nm); k is the smallest number with 2^k >= (U/U_ref)^POWER/TRIGGER.
+const double FLIGHT_LENGTH = 0.0125, POWER = 2.0 / 3.0, TRIGGER = 2.2;
+// U_ref is no less than this change of momentum a step, in units of the thermal one, and begins with no more than the multiple of
+// that. It changes by the rate in each step.
+const double FLOOR = 0.5, LARGEST_START = 4, FOLLOWING_RATE = 0.002;
+// What is thermal in a bath that is colder than this (K).
+const double COLDEST = 10;
+// Differences of the velocities of particles that are the same but for the rounding of both.
+const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
+// The drifts are solved to this fraction of the tolerance: what is left is not the same forwards and backwards.
+const double MARGIN = 0.1;
+const int NO_LIMIT = std::numeric_limits<int>::max();
+
+bool isFinite(const Vec3& x) {
+    return std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]);
+}
+
+} // namespace
+
+LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
+                                   const vector<ExpressionConstraint>& expressions) :
+        solver(masses, constraints, expressions), clusterForces(solver), groupEnergy(0), values(1, 0.0), reference(0),
+        lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1), isInProgress(false),
+        isAtStart(false), doublings(0), substep(0) {
+    for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
+        numbers->resize(getConstraintSystem().getNumConstraints());
+    for (Vectors* vectors : {&noise, &noForce})
+        vectors->resize(getConstraintSystem().getNumParticles());
+    theta = thetaNow = thetaMiddle = thetaNext = getConstraintSystem().getGivenParameters();
+    target = parameterChange = theta.values;
+    clusterSums.resize(clusterForces.getNumClusters());
+}
+
+void LangevinDynamics::setParallel(const Parallel& parallel, int numThreads) {
+    solver.setParallel(parallel, numThreads);
+}
+
+void LangevinDynamics::setSettings(const Settings& newSettings) {
+    if (newSettings.langevin.randomSeed != settings.langevin.randomSeed || seed == 0) {
+        seed = newSettings.langevin.randomSeed;
+        while (seed == 0)
+            seed = osrngseed();
+        numDrawn = 0;
+    }
+    settings = newSettings;
+    solver.setTolerance(settings.tolerance);
+    if (settings.langevin.reference > 0)
+        reference = settings.langevin.reference;
+    else if (reference > 0)
+        reference = std::max(reference, findFloor());
+}
+
+void LangevinDynamics::setRandomState(const vector<double>& state) {
+    seed = (int64_t) state.at(0);
+    numDrawn = (int64_t) state.at(1);
+}
+
+void LangevinDynamics::setReferences(const vector<double>& references) {
+    if (settings.langevin.reference == 0)
+        reference = references.at(0);
+}
+
+// ------------------------------------------------------------------------------------------- the monitor and its reference
+
+double LangevinDynamics::findFloor() const {
+    const double kT = BOLTZMANN * std::max(settings.langevin.temperature, COLDEST);
+    return settings.stepSize > 0 ? FLOOR * std::sqrt(kT) / settings.stepSize : 0.0;
+}
+
+void LangevinDynamics::startReference() {
+    if (reference == 0)
+        reference = std::max(findFloor(), std::min(values[0], LARGEST_START * findFloor()));
+}
+
+// A running median: nothing can capture it, whatever the steps were made of.
+void LangevinDynamics::followReference() {
+    if (settings.langevin.reference > 0 || settings.langevin.isReferenceFrozen)
+        return;
+    const double rate = values[0] > reference ? FOLLOWING_RATE : values[0] < reference ? -FOLLOWING_RATE : 0.0;
+    reference = std::max(findFloor(), reference * std::exp(rate));
+}
+
+// k, without its bound.
+int LangevinDynamics::findDoublings(double u) const {
+    const double asked = std::pow(u / reference, POWER) / TRIGGER;
+    if (!std::isfinite(asked))
+        return NO_LIMIT;
+    int result = 0;
+    for (double reached = 1; reached < asked; reached *= 2)
+        result++;
+    return result;
+}
+
+double LangevinDynamics::evaluateMonitor(const Vectors& positions, const ExpressionParameters& parameters,
+                                         const Vectors& velocities, const Vectors& forces,
+                                         const vector<double>& multipliers) {
+    const Vectors& netForces = clusterForces.findNetForces(positions, parameters, forces, multipliers);
+    const vector<int>& particles = solver.getMovingParticles();
+    std::fill(clusterSums.begin(), clusterSums.end(), 0.0);
+    for (size_t p = 0; p < particles.size(); p++) {
+        const int i = particles[p];
+        const double square = netForces[i].dot(netForces[i]);
+        clusterSums[clusterForces.getClusters()[p]] +=
+            square * getConstraintSystem().getInverseMasses()[i] +
+            std::sqrt(square) * velocities[i].dot(velocities[i]) * (1 / FLIGHT_LENGTH);
+    }
+    return ClusterForces::eighthRootOfFourthPowers(clusterSums);
+}
+
+// ------------------------------------------------------------------------------------------------- between two steps
+
+bool LangevinDynamics::projectPositions(Vectors& positions) {
+    isAtStart = false;
+    return solver.projectPositions(positions, theta);
+}
+
+void LangevinDynamics::adoptParameters() {
+    theta.values = target;
+}
+
+void LangevinDynamics::begin(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
+                             double energy) {
+    target = theta.values;
+    std::fill(theta.rates.begin(), theta.rates.end(), 0.0);
+    theta.isMoving = false;
+    takeState(positions, velocities, forces, energy);
+}
+
+void LangevinDynamics::changeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
+                                   double energy) {
+    takeState(positions, velocities, forces, energy);
+}
+
+void LangevinDynamics::takeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
+                                 double energy) {
+    const std::function<void()> putBack = remember();
+    q = positions;
+    v = velocities;
+    force = forces;
+    groupEnergy = energy;
+    lastSubstep = settings.stepSize;
+    settle();
+    try {
+        evaluateOnStep();
+    }
+    catch (...) {
+        putBack();
+        throw;
+    }
+}
+
+// A state has been put in place of the one there was.
+void LangevinDynamics::settle() {
+    isInProgress = isAtStart = false;
+    // Particles without mass stay as they are, in whatever array is written.
+    qNow = qMiddle = qNext = q;
+    vNow = wMiddle = wNext = vNext = v;
+}
+
+// P v, Lambda and U at q.
+void LangevinDynamics::evaluateOnStep() {
+    for (int i : solver.getMovingParticles())
+        if (!isFinite(force[i]))
+            throw StepFailure("the force on particle " + std::to_string(i) + " is infinite or not a number");
+    wNext = v;
+    solver.moveTo(q, theta, force);
+    solver.finish({q, wNext, force, theta, 0.0, v, lambda, rightSide, nullptr});
+    solver.moveToEnd();
+    isAtStart = true;
+    values[0] = evaluateMonitor(q, theta, v, force, lambda);
+}
+
+std::function<void()> LangevinDynamics::remember() {
+    return [this, positions = q, velocities = v, forces = force, energy = groupEnergy, parameters = theta,
+            nextParameters = target, memory = getMemory()] {
+        q = positions;
+        v = velocities;
+        force = forces;
+        groupEnergy = energy;
+        theta = parameters;
+        target = nextParameters;
+        lambda = memory.multipliers;
+        values[0] = memory.monitorValue;
+        lastSubstep = memory.lastSubstep;
+        settle();
+    };
+}
+
+LangevinDynamics::Memory LangevinDynamics::getMemory() const {
+    return {theta.values, theta.rates, lambda, values[0], lastSubstep};
+}
+
+void LangevinDynamics::resume(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
+                              const Memory& memory) {
+    theta.values = memory.parameters;
+    theta.rates = memory.parameterRates;
+    theta.isMoving = std::any_of(theta.rates.begin(), theta.rates.end(), [](double rate) { return rate != 0; });
+    q = positions;
+    v = velocities;
+    force = forces;
+    groupEnergy = energy;
+    lambda = memory.multipliers;
+    values[0] = memory.monitorValue;
+    lastSubstep = memory.lastSubstep;
+    settle();
+}
+
+bool LangevinDynamics::changeFrame(const Vectors& velocities) {
+    const vector<int>& particles = solver.getMovingParticles();
+    if (!getConstraintSystem().isTranslationInvariant() || particles.empty())
+        return false;
+    const Vec3 shift = velocities[particles[0]] - v[particles[0]];
+    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
+    const double largest = sizeOf(shift) + sizeOf(v[particles[0]]);
+    for (int i : particles)
+        if (!(sizeOf(velocities[i] - v[i] - shift) <= FRAME_ROUNDING * (largest + sizeOf(v[i]))))
+            return false;
+    for (int i : particles)
+        v[i] = velocities[i];
+    values[0] = evaluateMonitor(q, theta, v, force, lambda);
+    return true;
+}
+
+void LangevinDynamics::changeVelocities(const Vectors& velocities) {
+    takeState(Vectors(q), velocities, Vectors(force), groupEnergy);
+}
+
+void LangevinDynamics::changeForces(Vectors& forces, double energy) {
+    takeState(Vectors(q), Vectors(v), forces, energy);
+}
+
+void LangevinDynamics::reverse() {
+    for (int i : solver.getMovingParticles())
+        v[i] = -v[i];
+    for (double& each : theta.rates)
+        each = -each;
+}
+
+double LangevinDynamics::computeHalfStepKineticEnergy() {
+    const vector<int>& particles = solver.getMovingParticles();
+    for (int i : particles)
+        wNext[i] = vNext[i] = v[i] - force[i] * (0.5 * lastSubstep * getConstraintSystem().getInverseMasses()[i]);
+    if (!isAtStart)
+        solver.moveTo(q, theta, force);
+    isAtStart = true;
+    solver.addProjection(wNext, theta, vNext);
+    double sum = 0;
+    for (int i : particles)
+        sum += getConstraintSystem().getMasses()[i] * vNext[i].dot(vNext[i]);
+    return 0.5 * sum;
+}
+
+// ---------------------------------------------------------------------------------------------------------- a step
+
+// xi, once for all attempts.
+void LangevinDynamics::drawNoise() {
+    if (!givenNoise.empty()) {
+        noise = givenNoise;
+        return;
+    }
+    if (settings.langevin.friction == 0 || settings.langevin.temperature == 0)
+        return; // whatever it is, it is of no effect
+    for (int i : solver.getMovingParticles())
+        noise[i] = RandomNumbers::normal((uint64_t) seed, (uint64_t) numDrawn, (uint32_t) i);
+}
+
+double LangevinDynamics::step(double) {
+    if (!isInProgress) {
+        solver.beginStep();
+        startReference();
+        drawNoise();
+        getConstraintSystem().findParameterChange(q, theta, target, parameterChange);
+        doublings = std::min(findDoublings(values[0]), settings.langevin.maxDoublings);
+        startAttempt();
+    }
+    std::string reason;
+    while (!trySubstep(reason))
+        raise(reason);
+    const int substeps = LangevinSettings::getSubsteps(doublings);
+    return substep + 1 == substeps ? settings.stepSize : (substep + 1) * findSubstep();
+}
+
+// From the state before the step, with the present k.
+void LangevinDynamics::startAttempt() {
+    isInProgress = true;
+    substep = 0;
+    if (!isAtStart)
+        solver.moveTo(q, theta, force);
+    isAtStart = true;
+}
+
+// The attempt has failed.
+void LangevinDynamics::raise(const std::string& reason) {
+    if (doublings == settings.langevin.maxDoublings) {
+        evaluateMonitor(q, theta, v, force, lambda);
+        const auto hardest = std::max_element(clusterSums.begin(), clusterSums.end());
+        std::stringstream message;
+        message << reason << ", in a step of " << LangevinSettings::getSubsteps(doublings)
+                << " substeps (k = " << doublings << "); before it the monitor U was " << values[0] / reference
+                << " times its reference value";
+        if (hardest != clusterSums.end())
+            message << ", the hardest being " << clusterForces.describe((int) (hardest - clusterSums.begin()));
+        throw StepFailure(message.str());
+    }
+    doublings++;
+    startAttempt();
+}
+
+// Where the parameters are at a time of the step, on a straight way.
+void LangevinDynamics::setParametersAt(double time, ExpressionParameters& parameters) const {
+    const double part = time / settings.stepSize;
+    parameters.isMoving = false;
+    for (size_t k = 0; k < target.size(); k++) {
+        parameters.values[k] = part < 1 ? theta.values[k] + part * parameterChange[k] : target[k];
+        parameters.rates[k] = parameterChange[k] / settings.stepSize;
+        parameters.isMoving = parameters.isMoving || parameterChange[k] != 0;
+    }
+}
+
+// The first half of a substep, to qNext and wNext. Returns whether its equations have been solved.
+bool LangevinDynamics::trySubstep(std::string& reason) {
+    const bool isFirst = substep == 0;
+    const Vectors& start = isFirst ? v : vNow;
+    const vector<double>& guess = isFirst ? lambda : lambdaNow;
+    const int substeps = LangevinSettings::getSubsteps(doublings);
+    const double d = findSubstep(), end = substep + 1 == substeps ? settings.stepSize : (substep + 1) * d;
+    setParametersAt(end, thetaNext);
+    if (2 * substep + 1 != substeps)
+        return tryDrift({start, 0.5 * d, d, thetaNext, qNext, wNext, multipliers}, guess, reason);
+
+    setParametersAt(0.5 * settings.stepSize, thetaMiddle);
+    if (!tryDrift({start, 0.5 * d, 0.5 * d, thetaMiddle, qMiddle, wMiddle, multipliers}, guess, reason))
+        return false;
+    const double kT = BOLTZMANN * settings.langevin.temperature,
+                 damping = settings.langevin.friction * settings.stepSize;
+    const double a = std::exp(-damping), s = std::sqrt(-kT * std::expm1(-2 * damping));
+    for (int i : solver.getMovingParticles())
+        wMiddle[i] = wMiddle[i] * a + noise[i] * (s * std::sqrt(getConstraintSystem().getInverseMasses()[i]));
+    isAtStart = false;
+    solver.moveTo(qMiddle, thetaMiddle, noForce);
+    return tryDrift({wMiddle, 0.5 * d, 0.5 * d, thetaNext, qNext, wNext, multipliers}, noMultipliers, reason);
+}
+
+bool LangevinDynamics::tryDrift(const ConstraintSolver::Trial& trial, const vector<double>& guess,
+                                std::string& reason) {
+    try {
+        if (!solver.solvePositions(trial, {guess, nullptr, MARGIN})) {
+            reason = solver.explainFailure(trial);
+            return false;
+        }
+    }
+    catch (const StepFailure& failure) {
+        reason = failure.what();
+        return false;
+    }
+    for (int i : solver.getMovingParticles())
+        if (!isFinite(trial.positions[i])) {
+            reason = "the position of particle " + std::to_string(i) + " became infinite or not a number";
+            return false;
+        }
+    return true;
+}
+
+bool LangevinDynamics::finish(Vectors& forces, double energy) {
+    const int substeps = LangevinSettings::getSubsteps(doublings);
+    isAtStart = false;
+    for (int i : solver.getMovingParticles())
+        if (!isFinite(forces[i])) {
+            raise("the force on particle " + std::to_string(i) + " became infinite or not a number");
+            return false;
+        }
+    try {
+        solver.finish({qNext, wNext, forces, thetaNext, 0.5 * findSubstep(), vNext, lambdaNext, rightSide, nullptr});
+    }
+    catch (const StepFailure& failure) {
+        raise(failure.what());
+        return false;
+    }
+    if (++substep < substeps) {
+        qNow.swap(qNext);
+        vNow.swap(vNext);
+        std::swap(thetaNow, thetaNext);
+        lambdaNow.swap(lambdaNext);
+        forceNow = forces;
+        solver.moveToEnd(qNow, thetaNow, forceNow);
+        return false;
+    }
+    const double u = evaluateMonitor(qNext, thetaNext, vNext, forces, lambdaNext);
+    if (!std::isfinite(u)) {
+        raise("the monitor U became infinite or not a number");
+        return false;
+    }
+    if (doublings < settings.langevin.maxDoublings && findDoublings(u) > doublings) {
+        raise("");
+        return false;
+    }
+    q.swap(qNext);
+    v.swap(vNext);
+    force.swap(forces);
+    groupEnergy = energy;
+    std::swap(theta, thetaNext);
+    lambda.swap(lambdaNext);
+    solver.moveToEnd(q, theta, force);
+    solver.endStep();
+    isAtStart = true;
+    isInProgress = false;
+    values[0] = u;
+    lastSubstep = findSubstep();
+    numDrawn++;
+    numSubstepped += doublings > 0;
+    largestSubsteps = std::max(largestSubsteps, substeps);
+    followReference();
+    return true;
+}
+
+void LangevinDynamics::abandonStep() {
+    isInProgress = isAtStart = false;
+}

@@ -1,0 +1,207 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_LANGEVINDYNAMICS_H_
+#define OPENMMVRATTLE_LANGEVINDYNAMICS_H_
+
+#include "constraints/ConstraintSolver.h"
+#include "openmm/Vec3.h"
+#include "step/ClusterForces.h"
+#include "step/Dynamics.h"
+#include "step/LangevinSettings.h"
+#include <cstdint>
+#include <string>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * Langevin dynamics at the temperature T with steps of the size H, each made of n substeps d = H/n: n = 1 while all is calm, and n =
+ * 2^k + 1, always odd, when something is hard. With F = force(q), P the projection of velocities onto the constraints, and drift(s)
+ * the motion along v for the time s under the constraints (that is, l with g(q + s (v - M^-1 G(q)^T l)) = 0, then v -= M^-1 G(q)^T l
+ * and q += s v):
+ *
+ *     for i in 0 .. n-1
+ *         v += d/2 M^-1 F
+ *         if i = (n-1)/2:  drift(d/2);  v <- a v + sqrt(kT (1 - a^2)) M^-1/2 xi,  a = e^(-gamma H);  drift(d/2)
+ *         else:            drift(d)
+ *         F = force(q)
+ *         v = P (v + d/2 M^-1 F)
+ *
+ * k is the smallest that the monitor U asks for at both ends of the step (or k_max), and solves its equations; a step whose end asks
+ * for more is taken again from its beginning, **with the same noise xi**, for noise drawn anew would select against hard ends. That n
+ * is odd, with the noise in the middle of the central drift, makes every k sample the positions of a harmonic oscillator
+ * exactly; and each of the parts is reversible, so that k is the same in the reversed step, but for rare ones.
+ *
+ * The monitor measures the change of momentum by the net force f of the clusters c that constraints join,
+ *
+ *     A_c = sum_{i in c} (|f_i|^2/m_i + |f_i| |v_i|^2/l),   U = (sum_c A_c^4)^(1/8),
+ *
+ * and k is the smallest number with 2^k >= (U/U_ref)^(2/3)/c. U_ref follows U as a running median at a bounded rate: nothing can
+ * capture it, and no calibration is needed. docs/langevin.md has the reasons.
+ *
+ * As Dynamics has it, each substep is a pass of step() and finish().
+ */
+class LangevinDynamics : public Dynamics {
+public:
+    struct Settings {
+        double stepSize = 0, tolerance = 1e-8; // H (ps); of the constraints, relative
+        LangevinSettings langevin;
+    };
+    /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
+    struct Memory {
+        std::vector<double> parameters, parameterRates; // theta[n], and dtheta/dt of the step to it
+        std::vector<double> multipliers;                // Lambda(q[n],p[n]), in internal order
+        double monitorValue, lastSubstep;               // U(q[n],p[n]); d of the last step, H before it
+    };
+
+    LangevinDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
+                     const std::vector<ExpressionConstraint>& expressions = {});
+    void setParallel(const Parallel& parallel, int numThreads) override;
+    void setSettings(const Settings& newSettings);
+
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions) override;
+    void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    std::function<void()> remember() override;
+    Memory getMemory() const;
+    /** Go on from a saved state, taken as it is, to the last bit. */
+    void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
+    void setParameters(int expression, const std::map<std::string, double>& parameters) override {
+        getConstraintSystem().writeParameters(expression, parameters, target);
+    }
+    const ExpressionParameters& getParameters() const override {
+        return theta;
+    }
+    void adoptParameters() override;
+    void setReferences(const std::vector<double>& references) override;
+    std::vector<double> getReferences() const override {
+        return {reference};
+    }
+    void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities) override;
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities) override;
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+
+    /** A substep: the steps have the size H, whatever maxStep says. Fails if 2^k_max + 1 substeps are not enough. */
+    double step(double maxStep) override;
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    void abandonStep() override;
+    void reverse() override;
+
+    /**
+     * The kinetic energy of P (v - d/2 M^-1 F), the velocities half a substep before: at these velocities and not the on-step ones a
+     * vibration has its share of kT/2.
+     */
+    double computeHalfStepKineticEnergy();
+    /** The seed in force, and how many steps have drawn noise with it. */
+    std::vector<double> getRandomState() const {
+        return {(double) seed, (double) numDrawn};
+    }
+    void setRandomState(const std::vector<double>& state);
+    /** How many steps have been made of substeps, and of how many at most. */
+    long long getNumSubstepped() const {
+        return numSubstepped;
+    }
+    int getLargestSubsteps() const {
+        return largestSubsteps;
+    }
+    /**
+     * Let the next steps use these normal numbers, three for each particle, in place of drawn ones; none to draw them again. For tests
+     * against other statements of the method.
+     */
+    void setNoise(const std::vector<OpenMM::Vec3>& numbers) {
+        givenNoise = numbers;
+    }
+
+    const ConstraintSystem& getConstraintSystem() const override {
+        return solver.getSystem();
+    }
+    const std::vector<OpenMM::Vec3>& getPositions() const override {
+        return q;
+    }
+    const std::vector<OpenMM::Vec3>& getNextPositions() const override {
+        return qNext;
+    }
+    const std::vector<OpenMM::Vec3>& getVelocities() const override {
+        return v;
+    }
+    const std::vector<OpenMM::Vec3>& getForces() const override {
+        return force;
+    }
+    double getGroupEnergy() const override {
+        return groupEnergy;
+    }
+    /** 1: the steps have the size that they should have. */
+    double getDensity() const override {
+        return 1;
+    }
+    const std::vector<double>& getMonitorValues() const override {
+        return values;
+    }
+    const std::vector<double>& getMultipliers() const override {
+        return lambda;
+    }
+    long long getNumIterations() const override {
+        return solver.getNumIterations();
+    }
+
+private:
+    typedef std::vector<OpenMM::Vec3> Vectors;
+    double findFloor() const;
+    void startReference();
+    void followReference();
+    int findDoublings(double u) const;
+    double evaluateMonitor(const Vectors& positions, const ExpressionParameters& parameters, const Vectors& velocities,
+                           const Vectors& forces, const std::vector<double>& multipliers);
+    void takeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy);
+    void evaluateOnStep();
+    void settle();
+    void drawNoise();
+    void startAttempt();
+    void raise(const std::string& reason);
+    bool trySubstep(std::string& reason);
+    bool tryDrift(const ConstraintSolver::Trial& trial, const std::vector<double>& guess, std::string& reason);
+    void setParametersAt(double time, ExpressionParameters& parameters) const;
+    double findSubstep() const {
+        return settings.stepSize / LangevinSettings::getSubsteps(doublings);
+    }
+
+    ConstraintSolver solver;
+    ClusterForces clusterForces;
+    Settings settings;
+
+    // The state between two steps.
+    Vectors q, v, force;
+    double groupEnergy;
+    ExpressionParameters theta;  // theta[n], with the rates of the step that has led to q[n]
+    std::vector<double> target;  // theta[n+1], what the next step leads to
+    std::vector<double> lambda;  // Lambda(q[n],p[n])
+    std::vector<double> values;  // U(q[n],p[n]), alone
+    double reference;            // U_ref, 0 while it is not known
+    double lastSubstep;          // d of the last step; H if there was none since the state was changed
+    int64_t seed;                // 0: there is none yet
+    int64_t numDrawn;            // steps that have drawn noise
+    Vectors givenNoise;
+    long long numSubstepped;
+    int largestSubsteps;
+
+    // The step in progress.
+    bool isInProgress;
+    bool isAtStart;                      // the solver is at q[n]
+    int doublings, substep;              // k and i
+    Vectors noise;                       // xi
+    Vectors qNow, vNow, forceNow;        // at the beginning of a substep that is not the first
+    Vectors qMiddle, wMiddle, noForce;   // in the middle of the central drift
+    Vectors qNext, wNext, vNext;         // at its end, the velocities before the half kick and on step
+    ExpressionParameters thetaNow, thetaMiddle, thetaNext;
+    std::vector<double> parameterChange; // theta[n+1] - theta[n]
+    std::vector<double> lambdaNow, lambdaNext, multipliers, noMultipliers, rightSide;
+    std::vector<double> clusterSums;     // A_c
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_LANGEVINDYNAMICS_H_

@@ -1,0 +1,407 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "openmmvrattle/ConstrainedIntegrator.h"
+#include "ExpressionCheck.h"
+#include "MaxwellVelocities.h"
+#include "SystemCheck.h"
+#include "openmm/OpenMMException.h"
+#include "openmm/Platform.h"
+#include "openmm/internal/ContextImpl.h"
+#include "openmm/serialization/SerializationNode.h"
+#include "openmm/serialization/XmlSerializer.h"
+#include "openmmvrattle/VRattleKernels.h"
+#include "run/CheckpointBlock.h"
+#include "run/IntegratorRun.h"
+#include <algorithm>
+#include <cmath>
+#include <memory>
+#include <sstream>
+
+using namespace OpenMMVRattle;
+using OpenMM::ContextImpl;
+using OpenMM::OpenMMException;
+using OpenMM::Platform;
+using OpenMM::SerializationNode;
+using OpenMM::State;
+using OpenMM::XmlSerializer;
+using std::string;
+using std::vector;
+
+namespace {
+
+// Of the parameters that States hold; the settings among them have a version of their own.
+const int PARAMETERS_VERSION = 2;
+// Its square, by which multipliers act on positions, must not vanish.
+const double SMALLEST_STEP_SIZE = 1e-100;
+
+string majorMinor(const string& version) {
+    size_t first = version.find('.');
+    if (first == string::npos)
+        return version;
+    size_t second = version.find_first_not_of("0123456789", first + 1);
+    return version.substr(0, second);
+}
+
+// An OpenMM plugin depends on the binary interface of the OpenMM it was built against.
+void checkOpenMMVersion(const string& name) {
+    const string built = OPENMMVRATTLE_OPENMM_VERSION;
+    const string running = Platform::getOpenMMVersion();
+    if (majorMinor(running) != built)
+        throw OpenMMException(name + ": this plugin was built for OpenMM " + built + " and cannot run with OpenMM " +
+                              running + "; install openmm==" + built + ".* or rebuild the plugin");
+}
+
+// Whether a System has a constraint that could move anything, of its own or by expression.
+bool hasConstraints(const OpenMM::System& system, const IntegratorSettings& settings) {
+    for (int i = 0; i < system.getNumConstraints(); i++) {
+        int particle1, particle2;
+        double distance;
+        system.getConstraintParameters(i, particle1, particle2, distance);
+        if (system.getParticleMass(particle1) > 0 || system.getParticleMass(particle2) > 0)
+            return true;
+    }
+    return !settings.expressions.empty();
+}
+
+} // namespace
+
+ConstrainedIntegrator::ConstrainedIntegrator(const IntegratorSettings& given) :
+        settings(std::make_unique<IntegratorSettings>(given)), lastSaved(0) {
+    takeStepSize(given.stepSize);
+    Integrator::setConstraintTolerance(given.constraintTolerance);
+    Integrator::setIntegrationForceGroups(given.forceGroups);
+}
+
+ConstrainedIntegrator::~ConstrainedIntegrator() = default;
+
+// -------------------------------------------------------------------------------------------------------- the settings
+
+string ConstrainedIntegrator::getName() const {
+    return settings->getIntegratorName();
+}
+
+void ConstrainedIntegrator::requirePositive(double value, const string& name) const {
+    if (!(value > 0) || !std::isfinite(value)) {
+        std::stringstream message;
+        message << getName() << ": the " << name << " must be a positive finite number, not " << value;
+        throw OpenMMException(message.str());
+    }
+}
+
+// What 0 stands for belongs to the message.
+void ConstrainedIntegrator::requirePositiveOrZero(double value, const string& name, const string& zero) const {
+    if (!(value >= 0) || !std::isfinite(value)) {
+        std::stringstream message;
+        message << getName() << ": the " << name << " must be a positive finite number, or 0 " << zero << ", not "
+                << value;
+        throw OpenMMException(message.str());
+    }
+}
+
+void ConstrainedIntegrator::settingsChanged() {
+    if (run != nullptr)
+        run->settingsChanged();
+}
+
+// Replace all settings, those that the base class keeps as well.
+void ConstrainedIntegrator::takeOver(const IntegratorSettings& newSettings) {
+    *settings = newSettings;
+    Integrator::setStepSize(settings->stepSize);
+    Integrator::setConstraintTolerance(settings->constraintTolerance);
+    Integrator::setIntegrationForceGroups(settings->forceGroups);
+    settingsChanged();
+}
+
+void ConstrainedIntegrator::takeStepSize(double size) {
+    requirePositiveOrZero(size, "step size", "where no step is to be taken");
+    if (size > 0 && size < SMALLEST_STEP_SIZE) {
+        std::stringstream message;
+        message << getName() << ": a step size of " << size << " ps is too small to compute with; set one of "
+                << SMALLEST_STEP_SIZE << " ps or more";
+        throw OpenMMException(message.str());
+    }
+    settings->stepSize = size;
+    Integrator::setStepSize(size);
+    if (run != nullptr)
+        run->nominalStepChanged();
+}
+
+void ConstrainedIntegrator::setConstraintTolerance(double tol) {
+    requirePositive(tol, "constraint tolerance");
+    Integrator::setConstraintTolerance(tol);
+    settings->constraintTolerance = tol;
+    settingsChanged();
+}
+
+int ConstrainedIntegrator::getIntegrationForceGroups() const {
+    return settings->getActingForceGroups();
+}
+
+void ConstrainedIntegrator::setIntegrationForceGroups(int groups) {
+    Integrator::setIntegrationForceGroups(groups);
+    settings->forceGroups = groups;
+    settingsChanged();
+}
+
+// -------------------------------------------------------------------------------------------------- numbers of the run
+
+vector<double> ConstrainedIntegrator::getMultipliers() const {
+    return requireRun().getMultipliers();
+}
+
+long long ConstrainedIntegrator::getNumForceEvaluations() const {
+    return run == nullptr ? 0 : run->getDevice().getNumForceEvaluations();
+}
+
+long long ConstrainedIntegrator::getNumSolverIterations() const {
+    return run == nullptr ? 0 : run->getDevice().getNumSolverIterations();
+}
+
+// ------------------------------------------------------------------------------------------ constraints by expressions
+
+void ConstrainedIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
+                                            const std::map<string, double>& parameters) {
+    const string constraint = getName() + ": the constraint \"" + expression + "\" ";
+    vector<string> names;
+    for (const auto& parameter : parameters) {
+        names.push_back(parameter.first);
+        if (!std::isfinite(parameter.second))
+            throw OpenMMException(constraint + "has the parameter " + parameter.first +
+                                  ", whose value is not a finite number");
+    }
+    vector<int> sorted = particles;
+    std::sort(sorted.begin(), sorted.end());
+    if (!sorted.empty() && sorted[0] < 0)
+        throw OpenMMException(constraint + "is of particle " + std::to_string(sorted[0]) +
+                              ", and the index of a particle cannot be negative");
+    const auto twice = std::adjacent_find(sorted.begin(), sorted.end());
+    if (twice != sorted.end())
+        throw OpenMMException(constraint + "names particle " + std::to_string(*twice) +
+                              " twice; name each particle once");
+    const auto key = std::make_tuple(expression, particles.size(), names);
+    if (checkedExpressions.count(key) == 0) {
+        requireValidExpression(expression, (int) particles.size(), parameters, getName());
+        checkedExpressions.insert(key);
+    }
+}
+
+int ConstrainedIntegrator::addConstraint(const string& expression, const vector<int>& particles,
+                                         const std::map<string, double>& parameters) {
+    checkConstraint(expression, particles, parameters);
+    settings->expressions.push_back({expression, particles, parameters});
+    settingsChanged();
+    return (int) settings->expressions.size() - 1;
+}
+
+int ConstrainedIntegrator::getNumExpressionConstraints() const {
+    return (int) settings->expressions.size();
+}
+
+void ConstrainedIntegrator::checkExpressionConstraintIndex(int index) const {
+    if (index < 0 || index >= getNumExpressionConstraints())
+        throw OpenMMException(getName() + ": there is no expression constraint with index " + std::to_string(index) +
+                              "; the integrator has " + std::to_string(getNumExpressionConstraints()));
+}
+
+void ConstrainedIntegrator::getExpressionConstraintParameters(int index, string& expression, vector<int>& particles,
+                                                              std::map<string, double>& parameters) const {
+    checkExpressionConstraintIndex(index);
+    expression = settings->expressions[index].expression;
+    particles = settings->expressions[index].particles;
+    parameters = settings->expressions[index].parameters;
+}
+
+void ConstrainedIntegrator::setExpressionConstraintParameters(int index, const string& expression,
+                                                              const vector<int>& particles,
+                                                              const std::map<string, double>& parameters) {
+    checkExpressionConstraintIndex(index);
+    checkConstraint(expression, particles, parameters);
+    settings->expressions[index] = {expression, particles, parameters};
+    settingsChanged();
+}
+
+void ConstrainedIntegrator::setExpressionParameterValue(int index, const string& name, double value) {
+    checkExpressionConstraintIndex(index);
+    OpenMMVRattle::ExpressionConstraint changed = settings->expressions[index];
+    if (changed.parameters.count(name) == 0)
+        throw OpenMMException(getName() + ": the constraint \"" + changed.expression + "\" has no parameter " + name);
+    changed.parameters[name] = value;
+    setExpressionConstraintParameters(index, changed.expression, changed.particles, changed.parameters);
+}
+
+double ConstrainedIntegrator::getExpressionConstraintMultiplier(int index) const {
+    requireRun();
+    checkExpressionConstraintIndex(index);
+    const int numDistances = context->getSystem().getNumConstraints();
+    return getMultipliers().at(numDistances + index);
+}
+
+// ----------------------------------------------------------------------------------------------------------- the run
+
+IntegratorRun& ConstrainedIntegrator::requireRun() const {
+    if (run == nullptr)
+        throw OpenMMException("This Integrator is not bound to a context!");
+    return *run;
+}
+
+void ConstrainedIntegrator::step(int steps) {
+    requireRun().step(steps);
+}
+
+void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int randomSeed) {
+    IntegratorRun& inContext = requireRun();
+    if (!(temperature >= 0) || !std::isfinite(temperature)) {
+        std::stringstream message;
+        message << getName() + ": the temperature must be a finite number of kelvins that is not "
+                               "negative, not "
+                << temperature;
+        throw OpenMMException(message.str());
+    }
+    vector<OpenMM::Vec3> before;
+    context->getVelocities(before);
+    context->setVelocities(drawMaxwellVelocities(context->getSystem(), temperature, randomSeed));
+    try {
+        inContext.projectVelocities();
+    }
+    catch (...) {
+        context->setVelocities(before);
+        throw;
+    }
+}
+
+void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {
+    checkOpenMMVersion(getName());
+    if (owner != NULL && &contextRef.getOwner() != owner)
+        throw OpenMMException("This Integrator is already bound to a context");
+    requireSuitableSystem(contextRef, settings->expressions, getName());
+    const OpenMM::System& system = contextRef.getSystem();
+    settings->fitDefaultMonitor(hasConstraints(system, *settings));
+    OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
+    RunDevice& device = created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef, *this, *settings);
+    run = std::make_unique<IntegratorRun>(device, *settings, system.getNumParticles(),
+                                          RunState::fingerprintOf(system, *settings));
+    kernel = created;
+    context = &contextRef;
+    owner = &contextRef.getOwner();
+}
+
+void ConstrainedIntegrator::cleanup() {
+    run.reset();
+    kernel = OpenMM::Kernel();
+}
+
+vector<string> ConstrainedIntegrator::getKernelNames() {
+    return {IntegrateVRattleStepKernel::Name()};
+}
+
+void ConstrainedIntegrator::stateChanged(State::DataType changed) {
+    if (run == nullptr) // where Context::reinitialize() has failed
+        return;
+    // OpenMM announces Context::setParameter() as Parameters, and a Force's updateParametersInContext() as Energy.
+    if (changed == State::Parameters || changed == State::Energy)
+        run->forcesChanged();
+    else
+        run->stateChanged();
+}
+
+double ConstrainedIntegrator::computeKineticEnergy() {
+    IntegratorRun& here = requireRun();
+    const long long evaluations = here.getDevice().getNumForceEvaluations();
+    const int groups = context->getLastForceGroups();
+    const double energy = here.computeKineticEnergy();
+    // Whoever asks for it, as Context::getState() does, goes on to read the forces that it has had computed before.
+    if (here.getDevice().getNumForceEvaluations() != evaluations)
+        context->calcForcesAndEnergy(true, true, groups);
+    return energy;
+}
+
+// Nothing of ours does; but on GPUs energies without forces would leave none for the next step.
+bool ConstrainedIntegrator::kineticEnergyRequiresForce() const {
+    return run != nullptr && run->getDevice().usesForcesOfOthers();
+}
+
+// ---------------------------------------------------------------------------------------------- saving and restoring
+
+void ConstrainedIntegrator::resume(const IntegratorSettings& saved, RunState& state) {
+    const IntegratorSettings previous = *settings;
+    IntegratorSettings next = saved;
+    next.automaticRequest = previous.automaticRequest;
+    if (!next.hasSameConstraints(previous)) // the constraints are those of the Context, their parameters the saved ones
+        next.expressions = previous.expressions;
+    next.fitDefaultMonitor(hasConstraints(context->getSystem(), next));
+    if (next.isDefaultMonitor && next.monitors[0].kind != saved.monitors[0].kind)
+        state.references.clear();
+    run->requireUsable(state, next);
+    takeOver(next);
+    try {
+        run->resume(state);
+    }
+    catch (...) {
+        takeOver(previous);
+        throw;
+    }
+}
+
+void ConstrainedIntegrator::createCheckpoint(std::ostream& stream) const {
+    std::ostringstream text, data;
+    XmlSerializer::serialize(this, "Integrator", text);
+    const long long length = (long long) text.str().size();
+    data.write(reinterpret_cast<const char*>(&length), sizeof(length));
+    data.write(text.str().data(), length);
+    const RunState state = requireRun().save();
+    state.write(data);
+    CheckpointBlock::write(stream, data.str());
+    lastSaved = state.context;
+}
+
+void ConstrainedIntegrator::loadCheckpoint(std::istream& stream) {
+    run->stateChanged();
+    string block;
+    if (!CheckpointBlock::read(stream, block))
+        return; // it was written under another integrator
+    std::istringstream data(block);
+    long long length = 0;
+    data.read(reinterpret_cast<char*>(&length), sizeof(length));
+    string text(length, ' ');
+    data.read(&text[0], length);
+    std::istringstream xml(text);
+    std::unique_ptr<ConstrainedIntegrator> saved(XmlSerializer::deserialize<ConstrainedIntegrator>(xml));
+    if (saved->getName() != getName())
+        return;
+    RunState state;
+    state.read(data);
+    // Whoever has changed the masses or constraints calls Context::reinitialize(), which loads what was saved just before.
+    if (state.system != run->getSystemFingerprint() && state.context != lastSaved)
+        throw OpenMMException(getName() +
+                              ": this checkpoint was made with another System, whose "
+                              "masses or constraints are not those of this one; load it into a Context of that System");
+    resume(*saved->settings, state);
+}
+
+void ConstrainedIntegrator::serializeParameters(SerializationNode& node) const {
+    node.setIntProperty("version", PARAMETERS_VERSION);
+    node.setStringProperty("integrator", getName());
+    node.createChildNode("Settings", this);
+    requireRun().save().write(node.createChildNode("Run"));
+}
+
+void ConstrainedIntegrator::deserializeParameters(const SerializationNode& node) {
+    if (node.getStringProperty("integrator", "") != getName())
+        return; // they are another integrator's, or there are none
+    const int version = node.getIntProperty("version");
+    if (version != PARAMETERS_VERSION)
+        throw OpenMMException(getName() + ": the State holds parameters in version " + std::to_string(version) +
+                              " of their format and this plugin reads version " + std::to_string(PARAMETERS_VERSION) +
+                              "; use the version of the plugin that wrote them");
+    std::unique_ptr<ConstrainedIntegrator> saved(node.getChildNode("Settings").decodeObject<ConstrainedIntegrator>());
+    RunState state;
+    state.read(node.getChildNode("Run"));
+    // States are copied about: several Contexts go on from one, and one Context goes on from one after the other (replica exchange).
+    // So each keeps its seed, and no random number is drawn twice.
+    saved->settings->setRandomSeed(settings->getRandomSeed());
+    const vector<double> own = run->getDevice().getRandomState();
+    if (!own.empty() && own.size() == state.randomState.size())
+        state.randomState = {own[0], std::max(own[1], state.randomState[1])};
+    resume(*saved->settings, state);
+}
