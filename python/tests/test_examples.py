@@ -67,3 +67,16 @@ def test_clash_relaxation(tmp_path: Path) -> None:
     (fixed, fixed_error), (variable, variable_error) = [(int(number), float(error)) for number, error in found]
     assert variable == pytest.approx(fixed, rel=0.2)
     assert variable_error < fixed_error / 10
+
+
+def test_no_minimisation(tmp_path: Path) -> None:
+    """OpenMM's integrator fails, or is far too hot; ours goes on, at little more than an evaluation a step."""
+    output = run("no_minimisation.py", tmp_path)
+    theirs, ours = output.split("VariableStepRattleLangevinIntegrator")
+    rows = [line.split() for line in ours.splitlines() if re.fullmatch(r"[ \d-]+", line)]
+    assert [int(row[0]) for row in rows if row] == list(range(50, 401, 50))
+    rows = [row for row in rows if row]
+    assert 250 < float(rows[7][2]) < 400
+    evaluations = float(re.search(r"(\S+) evaluations a step", ours)[1])
+    assert 1 < evaluations < 1.5
+    assert "failed" in theirs or float(theirs.split()[-1]) > 400

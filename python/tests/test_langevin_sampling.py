@@ -1,0 +1,294 @@
+# OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+# SPDX-License-Identifier: MIT
+"""What VariableStepRattleLangevinIntegrator samples, against quadrature and theory.
+
+Seeds are fixed. Errors are standard errors of the mean over independent copies, or over blocks of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import openmm
+import pytest
+from langevin_statement import BOLTZMANN
+from openmm import app
+from openmmvrattle import VariableStepRattleLangevinIntegrator
+from openmmvrattle.testsystems import rigid_waters
+from run_support import degrees_of_freedom, relax, solvated
+
+KT = 300 * BOLTZMANN
+REFERENCE = openmm.Platform.getPlatform("Reference")
+
+
+def open_context(
+    system: openmm.System, positions: Any, step: float, friction: float, seed: int = 1, **settings: Any
+) -> tuple[openmm.Context, VariableStepRattleLangevinIntegrator]:
+    integrator = VariableStepRattleLangevinIntegrator(300, friction, step, randomNumberSeed=seed)
+    for name, value in settings.items():
+        getattr(integrator, name)(*value)
+    context = openmm.Context(system, integrator, REFERENCE)
+    context.setPositions(positions)
+    context.setVelocitiesToTemperature(300, seed)
+    return context, integrator
+
+
+def positions_of(context: openmm.Context) -> np.ndarray:
+    return context.getState(positions=True).getPositions(asNumpy=True)._value
+
+
+def mean_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Of independent values."""
+    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def blocks(values: Any, count: int = 20) -> tuple[float, float]:
+    """Of the values of a run, which are not independent."""
+    values = np.array(values)
+    values = values[len(values) % count :]
+    return mean_and_error(values.reshape(count, -1).mean(axis=1))
+
+
+def assert_agrees(what: str, measured: tuple[float, float], expected: float, largest: float, bias: float = 0) -> None:
+    """Within four standard errors, and what the step is known to do, where these are small enough to tell."""
+    mean, error = measured
+    print(f"{what}: {mean:.5f} +- {error:.5f}, expected {expected:.5f}")
+    assert error < largest * abs(expected), "the run is too short to tell"
+    assert abs(mean - expected) < 4 * error + bias * abs(expected)
+
+
+def quadrature(
+    weight: Callable[[np.ndarray], np.ndarray], value: Callable[[np.ndarray], np.ndarray], low: float, high: float
+) -> float:
+    x = np.linspace(low, high, 20001)
+    return float(np.sum(weight(x) * value(x)) / np.sum(weight(x)))
+
+
+def test_marginals_of_potentials() -> None:
+    """Along x harmonic with omega H = 1, along y quartic, along z a double well."""
+    count, mass, step = 400, 10.0, 0.004
+    length = 5 * step * np.sqrt(KT / mass)  # H is 0.2 in the units of kT, m and this, and 0.1 along z
+    potential = openmm.CustomExternalForce("k*x^2/2 + kT*(y/length)^4 + 3*kT*((z/(2*length))^2-1)^2")
+    for name, value in {"k": mass / step**2, "kT": KT, "length": length}.items():
+        potential.addGlobalParameter(name, value)
+    system = openmm.System()
+    for i in range(count):
+        system.addParticle(mass)
+        potential.addParticle(i, [])
+    system.addForce(potential)
+    signs = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
+    positions = np.stack([np.zeros(count), np.zeros(count), signs * 2 * length], axis=1)
+    context, integrator = open_context(system, positions, step, 30)
+    integrator.step(1000)  # from rest, so that the reference has to rise by a factor of three
+    substepped = integrator.getNumSubstepped()
+    samples = []
+    for _ in range(800):
+        integrator.step(10)
+        samples.append(positions_of(context))
+    q = np.array(samples)
+    x, y, z = q[:, :, 0] * np.sqrt(mass / KT) / step, q[:, :, 1] / length, q[:, :, 2] / (2 * length)
+
+    def measured(values: np.ndarray) -> tuple[float, float]:
+        return mean_and_error(values.mean(axis=0))
+
+    assert_agrees("harmonic <x^2>", measured(x**2), 1.0, 0.004)
+    assert_agrees("harmonic <x^4>", measured(x**4), 3.0, 0.01)
+
+    def quartic(y: np.ndarray) -> np.ndarray:
+        return np.exp(-(y**4))
+
+    # At twice this step the square is 0.7 % too small, and the error goes with the square of the step.
+    assert_agrees("quartic <y^2>", measured(y**2), quadrature(quartic, np.square, -4, 4), 0.005, bias=0.002)
+    assert_agrees("quartic <y^4>", measured(y**4), 0.25, 0.005, bias=0.002)
+
+    def well(z: np.ndarray) -> np.ndarray:
+        return np.exp(-3 * (z * z - 1) ** 2)
+
+    def is_on_top(z: np.ndarray) -> np.ndarray:
+        return (np.abs(z) < 0.3).astype(float)
+
+    assert_agrees("double well <z^2>", measured(z**2), quadrature(well, np.square, -4, 4), 0.005, bias=0.003)
+    assert_agrees("double well P(top)", measured(is_on_top(z)), quadrature(well, is_on_top, -4, 4), 0.05, bias=0.03)
+    assert integrator.getNumSubstepped() - substepped < 10
+
+
+@pytest.mark.parametrize(("step", "friction"), [(0.002, 100), (0.004, 50)])
+def test_temperature_of_rigid_water(step: float, friction: float) -> None:
+    """Eight waters in a trap: within 0.5 % as reported, and lower in the velocities, at 4 fs by more than a percent."""
+    waters = rigid_waters(8)
+    system = waters.system
+    trap = openmm.CustomExternalForce("20*(x^2+y^2+z^2)")
+    for i in range(0, system.getNumParticles(), 3):
+        trap.addParticle(i, [])
+    system.addForce(trap)
+    context, integrator = open_context(system, waters.positions, step, friction)
+    integrator.step(2000)
+    masses = np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
+    reported, by_hand = [], []
+    for _ in range(12000):
+        integrator.step(5)
+        state = context.getState(energy=True, velocities=True)
+        v = state.getVelocities(asNumpy=True)._value
+        for values, kinetic in (
+            (reported, state.getKineticEnergy()._value),
+            (by_hand, 0.5 * np.sum(masses * np.sum(v * v, axis=1))),
+        ):
+            values.append(2 * kinetic / (degrees_of_freedom(system) * BOLTZMANN))
+    assert_agrees(f"temperature at {1000 * step:g} fs", blocks(reported), 300, 0.0025, bias=0.001)
+    assert abs(np.mean(reported) - 300) < 0.005 * 300
+    mean, error = blocks(by_hand)
+    print(f"of the velocities {mean:.1f} +- {error:.1f}")
+    assert step == 0.002 or mean + 4 * error < 299.5
+    assert integrator.getNumSubstepped() <= 3
+
+
+def test_temperature_along_and_across_constraints_by_expressions() -> None:
+    """Dumbbells and chains of ten that no force acts on, and whose bonds are expressions."""
+    system = openmm.System()
+    positions: list[list[float]] = []
+    bonds = []
+    for copy in range(40):
+        for i, mass in enumerate((12.0, 2.0)):
+            system.addParticle(mass)
+            positions.append([0.1 * i, 0.4 * copy, 0])
+        bonds.append((2 * copy, 2 * copy + 1))
+    for copy in range(10):
+        for i in range(10):
+            particle = system.addParticle(14.0 if i % 3 else 2.0)
+            positions.append([0.09 * i, 0.04 * (i % 2), 1 + copy])
+            if i > 0:
+                bonds.append((particle - 1, particle))
+    length = {"length": 0.1}
+    integrator = VariableStepRattleLangevinIntegrator(300, 25, 0.004, randomNumberSeed=5)
+    for bond in bonds:
+        integrator.addConstraint("(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-length^2", bond, length)
+    context = openmm.Context(system, integrator, REFERENCE)
+    context.setPositions(positions)
+    integrator.setVelocitiesToTemperature(300, 2)
+    integrator.step(200)
+    masses = np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
+    first, second = np.array(bonds).T
+    turning, moving, chains, all_of_it = [], [], [], []
+    for _ in range(2500):
+        integrator.step(5)
+        state = context.getState(positions=True, velocities=True, energy=True)
+        q, v = (x(asNumpy=True)._value for x in (state.getPositions, state.getVelocities))
+        r, w = q[first] - q[second], v[first] - v[second]
+        assert np.max(np.abs(np.sum(r * w, axis=1))) < 1e-8  # along
+        assert np.max(np.abs(np.linalg.norm(r, axis=1) - 0.1)) < 1e-9
+        reduced = 12 * 2 / 14
+        turning.append(reduced * np.mean(np.sum(w[:40] ** 2, axis=1)) / (2 * KT))
+        centre = (12 * v[0:80:2] + 2 * v[1:80:2]) / 14
+        moving.append(14 * np.mean(centre**2) / KT)
+        chains.append(np.sum(masses[80:, None] * v[80:] ** 2) / (10 * 21 * KT))
+        all_of_it.append(state.getKineticEnergy()._value / (0.5 * KT * (40 * 5 + 10 * 21)))
+    assert_agrees("dumbbells across", blocks(turning), 1, 0.005, bias=0.001)
+    assert_agrees("dumbbells, centre", blocks(moving), 1, 0.005, bias=0.001)
+    assert_agrees("chains of ten", blocks(chains), 1, 0.005, bias=0.003)
+    assert_agrees("kinetic energy", blocks(all_of_it), 1, 0.003, bias=0.001)
+
+
+def test_angle_of_a_rigid_chain() -> None:
+    """Three beads with a light one in the middle: p(cos) goes with the root of the metric determinant."""
+    count, bond = 60, 0.1
+    system = openmm.System()
+    positions = []
+    for copy in range(count):
+        for i, mass in enumerate((14.0, 1.0, 14.0)):
+            system.addParticle(mass)
+            positions.append([bond * i, bond * (i == 2), copy])
+            positions[-1][0] = bond * min(i, 1)
+        for i in range(2):
+            system.addConstraint(3 * copy + i, 3 * copy + i + 1, bond)
+    context, integrator = open_context(system, positions, 0.004, 5, seed=3)
+    integrator.step(500)
+    cosines = []
+    for _ in range(1200):
+        integrator.step(10)
+        q = positions_of(context).reshape(count, 3, 3)
+        cosines.append(np.sum((q[:, 0] - q[:, 1]) * (q[:, 2] - q[:, 1]), axis=2 - 1) / bond**2)
+    c = np.array(cosines)
+
+    def weight(c: np.ndarray) -> np.ndarray:
+        return np.sqrt((1 + 1 / 14) ** 2 - c**2)
+
+    expected = quadrature(weight, np.square, -1, 1)
+    assert abs(expected - 1 / 3) > 0.05  # which a wrong metric would give
+    assert_agrees("<cos^2>", mean_and_error((c**2).mean(axis=0)), expected, 0.02)
+    assert_agrees("1 + <cos>", mean_and_error(1 + c.mean(axis=0)), 1, 0.03)
+
+
+@pytest.mark.parametrize("step", [0.004, 0.008])
+def test_where_substeps_occur(step: float) -> None:
+    """I-H-I with bonds of 0.16 nm whose ends repel each other: the light atom whips the chain through the collision."""
+    count, bond, sigma, epsilon = 10, 0.16, 0.25, 4.0
+    system = openmm.System()
+    repulsion = openmm.CustomBondForce("step(2^(1/6)*sigma-r)*(4*epsilon*((sigma/r)^12-(sigma/r)^6)+epsilon)")
+    repulsion.addGlobalParameter("sigma", sigma)
+    repulsion.addGlobalParameter("epsilon", epsilon)
+    positions = []
+    for copy in range(count):
+        for i, mass in enumerate((127.0, 1.0, 127.0)):
+            system.addParticle(mass)
+            positions.append([bond * i, 0.03 * (i == 1), copy])
+        for i in range(2):
+            system.addConstraint(3 * copy + i, 3 * copy + i + 1, bond)
+        repulsion.addBond(3 * copy, 3 * copy + 2, [])
+    system.addForce(repulsion)
+    context, integrator = open_context(system, positions, step, 5, seed=3)
+    integrator.step(500)
+    cosines, energies = [], []
+    evaluations, steps = integrator.getNumForceEvaluations(), 150000
+    for _ in range(steps // 10):
+        integrator.step(10)
+        state = context.getState(positions=True, energy=True)
+        q = state.getPositions(asNumpy=True)._value.reshape(count, 3, 3)
+        cosines.append(np.mean(np.sum((q[:, 0] - q[:, 1]) * (q[:, 2] - q[:, 1]), axis=1)) / bond**2)
+        energies.append(state.getPotentialEnergy()._value / (count * KT))
+    evaluations = integrator.getNumForceEvaluations() - evaluations
+    print(f"k > 0 in {integrator.getNumSubstepped()} of {steps} steps, {evaluations / steps:.3f} evaluations a step")
+
+    def energy(c: np.ndarray) -> np.ndarray:
+        sixth = (sigma / (bond * np.sqrt(2 - 2 * c))) ** 6
+        return np.where(sixth > 0.5, 4 * epsilon * (sixth**2 - sixth) + epsilon, 0)
+
+    def weight(c: np.ndarray) -> np.ndarray:
+        return np.sqrt((1 + 1 / 127) ** 2 - c**2) * np.exp(-energy(c) / KT)
+
+    low, high = -1, 0.5
+    expected = quadrature(weight, lambda c: c, low, high)
+    assert_agrees("<cos>", blocks(cosines), expected, 0.01, bias=0.005)
+    expected = quadrature(weight, energy, low, high) / KT
+    assert_agrees("<V>/kT", blocks(energies), expected, 0.02, bias=0.005)
+    assert integrator.getNumSubstepped() > 20
+
+
+@pytest.mark.claims
+@pytest.mark.parametrize("step", [0.002, 0.004])
+def test_potential_energy_of_water_is_that_of_openmm(step: float) -> None:
+    """32 waters: the means of runs of both integrators at the same step differ by no more than their errors."""
+    modeller, force_field = solvated(count=32)
+    system = force_field.createSystem(modeller.topology, nonbondedMethod=app.CutoffPeriodic, nonbondedCutoff=0.45)
+    positions, _ = relax(system, modeller.positions)
+    results = []
+    for integrator in (
+        VariableStepRattleLangevinIntegrator(300, 10, step, randomNumberSeed=8),
+        openmm.LangevinMiddleIntegrator(300, 10, step),
+    ):
+        integrator.setRandomNumberSeed(8)
+        integrator.setConstraintTolerance(1e-8)
+        context = openmm.Context(system, integrator, REFERENCE)
+        context.setPositions(positions.reshape(-1, 3))
+        context.setVelocitiesToTemperature(300, 8)
+        integrator.step(round(20 / step))
+        energies = []
+        for _ in range(round(400 / step) // 25):
+            integrator.step(25)
+            energies.append(context.getState(energy=True).getPotentialEnergy()._value)
+        results.append(blocks(energies, 40))
+    (mine, error), (other, other_error) = results
+    print(f"{step} ps: {mine:.1f} +- {error:.1f}, LangevinMiddleIntegrator {other:.1f} +- {other_error:.1f} kJ/mol")
+    assert abs(mine - other) < 4 * np.hypot(error, other_error)
+    assert np.hypot(error, other_error) < 0.01 * abs(other)
