@@ -35,8 +35,9 @@ Incidence findIncidence(const vector<vector<int>>& particlesOf, int numParticles
     return result;
 }
 
-// The particles in the order of a breadth-first walk.
-vector<int> walkBreadthFirst(int start, const vector<vector<int>>& particlesOf, const Incidence& incidence) {
+// The particles in the order of a breadth-first walk; and from which each has been reached, if that is asked for.
+vector<int> walkBreadthFirst(int start, const vector<vector<int>>& particlesOf, const Incidence& incidence,
+                             vector<int>* parents = nullptr) {
     vector<char> seen(incidence.start.size() - 1, false), seenConstraints(particlesOf.size(), false);
     vector<int> queue = {start};
     seen[start] = true;
@@ -49,10 +50,41 @@ vector<int> walkBreadthFirst(int start, const vector<vector<int>>& particlesOf, 
             for (int i : particlesOf[k])
                 if (!seen[i]) {
                     seen[i] = true;
+                    if (parents != nullptr)
+                        (*parents)[i] = queue[next];
                     queue.push_back(i);
                 }
         }
     return queue;
+}
+
+// The particles of a cluster in order; afterwards the constraints have them by their places there.
+vector<int> numberParticles(vector<vector<int>>& particlesOf) {
+    vector<int> particles;
+    for (const auto& list : particlesOf)
+        particles.insert(particles.end(), list.begin(), list.end());
+    std::sort(particles.begin(), particles.end());
+    particles.erase(std::unique(particles.begin(), particles.end()), particles.end());
+    for (auto& list : particlesOf)
+        for (int& i : list)
+            i = (int) (std::lower_bound(particles.begin(), particles.end(), i) - particles.begin());
+    return particles;
+}
+
+// The pieces from those of the particles.
+ClusterCut collect(const vector<int>& particles, const vector<vector<int>>& particlesOf, const vector<int>& pieceOf,
+                   int numPieces) {
+    ClusterCut result;
+    result.pieces.resize(numPieces);
+    for (size_t i = 0; i < particles.size(); i++)
+        result.pieces[pieceOf[i]].particles.push_back(particles[i]);
+    for (size_t k = 0; k < particlesOf.size(); k++) {
+        const int piece = pieceOf[particlesOf[k][0]];
+        const bool isWithin =
+            std::all_of(particlesOf[k].begin(), particlesOf[k].end(), [&](int i) { return pieceOf[i] == piece; });
+        (isWithin ? result.pieces[piece].constraints : result.joints).push_back((int) k);
+    }
+    return result;
 }
 
 } // namespace
@@ -61,40 +93,49 @@ ClusterCut cutCluster(const vector<vector<int>>& given, int pieceSize) {
     const int numPieces = (int) given.size() / pieceSize;
     if (numPieces < 2)
         return ClusterCut();
-    vector<int> particles;
-    for (const auto& list : given)
-        particles.insert(particles.end(), list.begin(), list.end());
-    std::sort(particles.begin(), particles.end());
-    particles.erase(std::unique(particles.begin(), particles.end()), particles.end());
     vector<vector<int>> particlesOf = given;
-    for (auto& list : particlesOf)
-        for (int& i : list)
-            i = (int) (std::lower_bound(particles.begin(), particles.end(), i) - particles.begin());
+    const vector<int> particles = numberParticles(particlesOf);
 
     // From one end to the other, cut where enough particles have been passed.
     const int numParticles = (int) particles.size();
     const Incidence incidence = findIncidence(particlesOf, numParticles);
     const int end = walkBreadthFirst(0, particlesOf, incidence).back();
     const vector<int> order = walkBreadthFirst(end, particlesOf, incidence);
-    ClusterCut result;
-    result.pieces.resize(numPieces);
     vector<int> pieceOf(numParticles);
-    for (size_t place = 0; place < order.size(); place++) {
-        const int piece = (int) (place * numPieces / order.size());
-        pieceOf[order[place]] = piece;
-        result.pieces[piece].particles.push_back(particles[order[place]]);
-    }
-    for (size_t k = 0; k < particlesOf.size(); k++) {
-        const int piece = pieceOf[particlesOf[k][0]];
-        const bool isWithin =
-            std::all_of(particlesOf[k].begin(), particlesOf[k].end(), [&](int i) { return pieceOf[i] == piece; });
-        (isWithin ? result.pieces[piece].constraints : result.joints).push_back((int) k);
-    }
+    for (size_t place = 0; place < order.size(); place++)
+        pieceOf[order[place]] = (int) (place * numPieces / order.size());
+    ClusterCut result = collect(particles, particlesOf, pieceOf, numPieces);
     if ((double) result.joints.size() > MAX_JOINTS * (double) given.size())
         return ClusterCut();
-    for (ClusterCut::Piece& piece : result.pieces)
-        std::sort(piece.particles.begin(), piece.particles.end());
     return result;
+}
+
+ClusterCut cutClusterAlongTree(const vector<vector<int>>& given, int pieceSize) {
+    vector<vector<int>> particlesOf = given;
+    const vector<int> particles = numberParticles(particlesOf);
+    const int numParticles = (int) particles.size();
+    const Incidence incidence = findIncidence(particlesOf, numParticles);
+    vector<int> parents(numParticles, -1);
+    const int end = walkBreadthFirst(0, particlesOf, incidence).back();
+    const vector<int> order = walkBreadthFirst(end, particlesOf, incidence, &parents);
+    // From the leaves on: a branch that is large enough is a piece.
+    vector<int> weights(numParticles, 1), heads;
+    for (auto i = order.rbegin(); i != order.rend(); ++i) {
+        if (weights[*i] >= pieceSize || parents[*i] < 0)
+            heads.push_back(*i);
+        else
+            weights[parents[*i]] += weights[*i];
+    }
+    // What is left at the root may be little: the last branch goes with it.
+    if (heads.size() > 1 && weights[heads.back()] < pieceSize / 2)
+        heads.erase(heads.end() - 2);
+    vector<int> pieceOf(numParticles, -1);
+    for (size_t piece = 0; piece < heads.size(); piece++)
+        pieceOf[heads[piece]] = (int) piece;
+    for (int i : order)
+        if (pieceOf[i] < 0)
+            pieceOf[i] = pieceOf[parents[i]];
+    return collect(particles, particlesOf, pieceOf, (int) heads.size());
 }
 
 } // namespace OpenMMVRattle

@@ -30,6 +30,14 @@ struct ClusterCut {
  */
 ClusterCut cutCluster(const std::vector<std::vector<int>>& particlesOf, int pieceSize);
 
+/**
+ * Cut a cluster along a tree that spans it, into pieces of at least pieceSize particles and mostly not many more: a molecule, which is
+ * nearly a tree, gets about one joint a piece.
+ *
+ * @param particlesOf    the moving particles of each constraint of the cluster, which hang together
+ */
+ClusterCut cutClusterAlongTree(const std::vector<std::vector<int>>& particlesOf, int pieceSize);
+
 } // namespace OpenMMVRattle
 
 #endif // OPENMMVRATTLE_CLUSTERCUT_H_

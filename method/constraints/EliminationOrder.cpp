@@ -169,9 +169,9 @@ EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
     return arrange(order, levels, places, numNarrow);
 }
 
-EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries) {
+EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, int numOuter) {
     const int SLACK = 2, FEW = 5;
-    vector<vector<int>> neighbours(size); // of what is left, sorted
+    vector<vector<int>> neighbours(size + numOuter); // of what is left, sorted
     for (const auto& entry : entries) {
         neighbours[entry.first].push_back(entry.second);
         neighbours[entry.second].push_back(entry.first);
@@ -183,7 +183,7 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries) {
     vector<int> order, left(size), chosen, candidates, joined;
     std::iota(left.begin(), left.end(), 0);
     std::for_each(neighbours.begin(), neighbours.end(), sortUnique);
-    vector<int> blockedIn(size, -1); // the round in which a neighbour has been chosen
+    vector<int> blockedIn(size + numOuter, -1); // the round in which a neighbour has been chosen
     vector<char> isGone(size, false);
     for (int round = 0; !left.empty(); round++) {
         auto degree = [&](int row) { return neighbours[row].size(); };
@@ -220,7 +220,7 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries) {
     }
     if (!left.empty()) {
         MatrixEntries rest;
-        vector<int> placeOf(size);
+        vector<int> placeOf(size + numOuter, size); // an outer row is behind all
         for (size_t k = 0; k < left.size(); k++)
             placeOf[left[k]] = (int) k;
         for (int row : left)
@@ -230,7 +230,9 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries) {
         for (int place : findEliminationOrder((int) left.size(), rest).rows)
             order.push_back(left[place]);
     }
-    const EliminationTree tree = findEliminationTree(size, reorder(entries, order));
+    for (int row = size; row < size + numOuter; row++)
+        order.push_back(row);
+    const EliminationTree tree = findEliminationTree(size + numOuter, reorder(entries, order));
     const vector<int> levels = findLevels(tree);
     vector<int> places(size);
     std::iota(places.begin(), places.end(), 0);

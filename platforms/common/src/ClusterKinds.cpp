@@ -27,7 +27,7 @@ int findRoot(vector<int>& parents, int particle) {
 
 } // namespace
 
-vector<ClusterKind> ClusterKinds::find(const OpenMM::System& system) {
+ClusterKinds::ClusterKinds(const OpenMM::System& system) {
     const int numParticles = system.getNumParticles();
     vector<int> parents(numParticles), degrees(numParticles, 0);
     std::iota(parents.begin(), parents.end(), 0);
@@ -79,15 +79,9 @@ vector<ClusterKind> ClusterKinds::find(const OpenMM::System& system) {
         kind.lengths.push_back(lengths);
         kind.constraints.push_back(constraints);
     }
-    vector<ClusterKind> kinds;
     for (auto& entry : found)
-        kinds.push_back(std::move(entry.second));
-    std::stable_sort(kinds.begin(), kinds.end(),
-                     [](const ClusterKind& a, const ClusterKind& b) { return a.pairs.size() > b.pairs.size(); });
-    return kinds;
-}
-
-bool ClusterKinds::areAllSmall(const vector<ClusterKind>& kinds) {
-    return std::all_of(kinds.begin(), kinds.end(),
-                       [](const ClusterKind& kind) { return kind.pairs.size() <= MAX_CONSTRAINTS; });
+        ((int) entry.second.pairs.size() > MAX_CONSTRAINTS ? large : small).push_back(std::move(entry.second));
+    for (vector<ClusterKind>* kinds : {&small, &large})
+        std::stable_sort(kinds->begin(), kinds->end(),
+                         [](const ClusterKind& a, const ClusterKind& b) { return a.pairs.size() > b.pairs.size(); });
 }

@@ -22,13 +22,14 @@ struct ClusterKind {
     std::vector<std::vector<int>> constraints;      // of each cluster, by indices of the System
 };
 
+/** Sort the particles of a System that have mass into kinds; those with most constraints come first. */
 class ClusterKinds {
 public:
+    /** What one thread can have. */
     static const int MAX_CONSTRAINTS = 8;
-    /** Sort the particles of a System that have mass into kinds; those with most constraints come first. */
-    static std::vector<ClusterKind> find(const OpenMM::System& system);
-    /** Whether no cluster has more than MAX_CONSTRAINTS constraints. */
-    static bool areAllSmall(const std::vector<ClusterKind>& kinds);
+    explicit ClusterKinds(const OpenMM::System& system);
+    /** The kinds with up to MAX_CONSTRAINTS constraints, and those with more. */
+    std::vector<ClusterKind> small, large;
 };
 
 } // namespace OpenMMVRattle

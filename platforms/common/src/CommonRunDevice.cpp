@@ -47,7 +47,7 @@ CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeCo
         settledCount(0), knownCount(0), groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true),
         numDeviceRescues(0) {
     compute.initializeContexts();
-    if (DeviceSteps::canTake(context.getSystem(), settings.expressions))
+    if (DeviceSteps::canTake(settings.expressions))
         steps = std::make_unique<DeviceSteps>(compute, context.getSystem());
     ContextSelector selector(compute);
     compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context

@@ -23,18 +23,42 @@ const double SINGLE_TOLERANCE = 1e-5, MIXED_TOLERANCE = 1e-12, DOUBLE_TOLERANCE 
 const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
 const double SINGLE_DENSITY_ROUNDING = 1e-4, DENSITY_ROUNDING = 1e-8;
 const double MARGIN = 0.1;
+// Of a large cluster: an iteration that takes longer is left to the host. In each launch all stages have stamps of their own.
+const int MAX_STAGES = 16, STAMPS = 32;
+// A factor in single precision solves to about 1e-7, so velocities are projected twice where more is asked for.
+const double SINGLE_PROJECTION = 1e-7;
+
+// Local memory of a work group, of which every device of OpenCL has 32 kB, every GPU of NVIDIA 48.
+LargeClusters::Limits findLimits(OpenMM::ComputeContext& context) {
+    const bool isCUDA = context.getContextImpl()->getPlatform().getName() == "CUDA";
+    LargeClusters::Limits limits;
+    limits.numThreads = context.getIsCPU() ? 1 : StepProgram::getGroupSize(true);
+    limits.localMemory = (isCUDA ? 48 : 32) * 1024 - 8 * 1024; // the rest is for sums
+    // OpenMM counts six groups for each processor, and one has room in any case.
+    limits.numResident = isCUDA ? context.getNumThreadBlocks() / 6 : 0;
+    limits.narrow = isCUDA ? 32 : 0;
+    limits.mixedSize = context.getUseMixedPrecision() || context.getUseDoublePrecision() ? 8 : 4;
+    limits.realSize = context.getUseDoublePrecision() ? 8 : 4;
+    limits.pieceSize = 64;
+    return limits;
+}
 
 } // namespace
 
 DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system) :
-        context(context), kinds(ClusterKinds::find(system)), settings(),
+        DeviceSteps(context, ClusterKinds(system)) {
+}
+
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters) :
+        context(context), kinds(clusters.small), large(clusters.large, findLimits(context)), settings(),
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
-        isWide(context.getSupportsDoublePrecision()), numGroups(0), half(0), stepNumber(0), groupEnergy(0),
+        isWide(context.getSupportsDoublePrecision()), groupSize(StepProgram::getGroupSize(!large.isEmpty())),
+        numGroups(0), numPartials(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), groupEnergy(0),
         elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
 }
 
-bool DeviceSteps::canTake(const OpenMM::System& system, const vector<ExpressionConstraint>& expressions) {
-    return expressions.empty() && ClusterKinds::areAllSmall(ClusterKinds::find(system));
+bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
+    return expressions.empty();
 }
 
 double DeviceSteps::tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance) {
@@ -65,16 +89,52 @@ void DeviceSteps::initialize() {
     lengths.upload(lengthData, true);
     multipliers.initialize(context, lengthData.size(), mixedSize, "vrattleMultipliers");
     context.clearBuffer(multipliers);
-    const int group = StepProgram::GROUP_SIZE, needed = (program->getNumSlots() + group - 1) / group;
+    const int needed = (program->getNumSlots() + groupSize - 1) / groupSize;
     numGroups = std::max(1, std::min(needed, context.getNumThreadBlocks()));
+    numPartials = numGroups + (int) large.getPieces().size();
     oldPositions.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldPositions");
     oldVelocities.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldVelocities");
     for (OpenMM::ComputeArray& array : trials)
         array.initialize(context, Control::TrialSize, wideSize, "vrattleTrial");
     failure.initialize<int>(context, 2, "vrattleFailure");
     failure.upload(vector<int>{0, 0});
-    iterationCounts.initialize<int>(context, numGroups * group, "vrattleIterations");
+    iterationCounts.initialize<int>(context, numGroups * groupSize, "vrattleIterations");
     context.clearBuffer(iterationCounts);
+    if (!large.isEmpty())
+        initializeLarge();
+}
+
+void DeviceSteps::initializeLarge() {
+    const int mixedSize = isMixed ? 8 : 4, realSize = context.getUseDoublePrecision() ? 8 : 4;
+    const int numPieces = (int) large.getPieces().size();
+    // An array of vectors from structures, and an array that has at least one element.
+    auto upload = [&](OpenMM::ComputeArray& array, const auto& data, int elementSize, const char* name) {
+        array.initialize(context, std::max<size_t>(1, data.size() * sizeof(data[0]) / elementSize), elementSize, name);
+        if (!data.empty())
+            array.upload(data.data());
+    };
+    auto uploadMixed = [&](OpenMM::ComputeArray& array, vector<double> data, const char* name) {
+        data.resize(std::max<size_t>(1, data.size()));
+        array.initialize(context, data.size(), mixedSize, name);
+        array.upload(data, true);
+    };
+    auto clear = [&](OpenMM::ComputeArray& array, size_t size, int elementSize, const char* name) {
+        array.initialize(context, std::max<size_t>(1, size), elementSize, name);
+        context.clearBuffer(array);
+    };
+    upload(largeTables, large.getTables(), 16, "vrattleTables");
+    upload(largePieces, large.getPieces(), 16, "vrattlePieces");
+    upload(largeRows, large.getRows(), 16, "vrattleRows");
+    upload(largeAtoms, large.getAtoms(), 4, "vrattleLargeAtoms");
+    upload(largeJoints, large.getJoints(), 16, "vrattleJoints");
+    uploadMixed(largeRowLengths, large.getRowLengths(), "vrattleRowLengths");
+    uploadMixed(largeJointLengths, large.getJointLengths(), "vrattleJointLengths");
+    clear(largeMultipliers, large.getNumConstraints(), mixedSize, "vrattleLargeMultipliers");
+    clear(largeFactors, large.getNumFactors(), realSize, "vrattleFactors");
+    clear(largeWork, large.getNumWork(), mixedSize, "vrattleWork");
+    clear(largeExchange, large.getNumWords(), 8, "vrattleExchange");
+    clear(largePhases, numPieces, 4, "vrattlePhases");
+    clear(largeIterations, numPieces, 4, "vrattleLargeIterations");
 }
 
 void DeviceSteps::setSettings(const Settings& newSettings) {
@@ -99,7 +159,7 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
 }
 
 void DeviceSteps::compile(StepProgram::Update update) {
-    std::unique_ptr<StepProgram> next(new StepProgram(kinds, settings.terms, update, isMixed, isWide));
+    std::unique_ptr<StepProgram> next(new StepProgram(kinds, large, settings.terms, update, isMixed, isWide));
     const bool isFirst = program == nullptr;
     program.swap(next);
     if (isFirst)
@@ -115,9 +175,9 @@ void DeviceSteps::compile(StepProgram::Update update) {
     resize(settingsArray, Control::FirstTerm + 3 * settings.terms.size(), wideSize, "vrattleSettings");
     for (OpenMM::ComputeArray& array : control)
         resize(array, Control::FirstValue + settings.terms.size(), wideSize, "vrattleControl");
-    resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numGroups, mixedSize, "vrattlePartials");
+    resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numPartials, mixedSize, "vrattlePartials");
     for (OpenMM::ComputeArray& array : trialPartials)
-        resize(array, numSums * numGroups, mixedSize, "vrattleTrialPartials");
+        resize(array, numSums * numPartials, mixedSize, "vrattleTrialPartials");
     std::string key = program->getSource();
     for (const auto& define : program->getDefines())
         key += define.first + "=" + define.second + "\n";
@@ -131,7 +191,15 @@ void DeviceSteps::compile(StepProgram::Update update) {
             created.trial = text->createKernel("tryStep");
         created.advance = text->createKernel("advanceStep");
         created.restore = text->createKernel("restoreState");
+        if (!large.isEmpty()) {
+            created.finishLarge = text->createKernel("finishLarge");
+            if (program->hasHalfSums())
+                created.tryLarge = text->createKernel("tryLarge");
+            created.advanceLarge = text->createKernel("advanceLarge");
+        }
         setArguments(created);
+        if (!large.isEmpty())
+            setLargeArguments(created);
         found = compiled.insert({key, created}).first;
     }
     kernels = found->second;
@@ -161,6 +229,7 @@ void DeviceSteps::setArguments(Kernels& created) {
     addEmpty(created.finish, 5); // step, kick, isFormed, isStored, control
     created.finish->addArg(settingsArray);
     created.finish->addArg(partials);
+    created.finish->addArg(numPartials);
     addState(created.finish);
 
     addEmpty(created.evaluate, 5); // step, isRescaled, groupEnergy, numPartials, control
@@ -194,6 +263,49 @@ void DeviceSteps::setArguments(Kernels& created) {
     created.restore->addArg(oldVelocities);
 }
 
+// The same for kernels/large.cc.
+void DeviceSteps::setLargeArguments(Kernels& created) {
+    OpenMM::ArrayInterface& corrections =
+        context.getUseMixedPrecision() ? context.getPosqCorrection() : context.getPosq();
+    auto addEmpty = [](ComputeKernel& kernel, int count) {
+        for (int i = 0; i < count; i++)
+            kernel->addArg();
+    };
+    auto addState = [&](ComputeKernel& kernel) {
+        kernel->addArg((int) large.getPieces().size());
+        kernel->addArg(context.getPaddedNumAtoms());
+        kernel->addArg(context.getPosq());
+        kernel->addArg(corrections);
+        kernel->addArg(context.getVelm());
+        kernel->addArg(context.getLongForceBuffer());
+        kernel->addArg(failure);
+        for (OpenMM::ComputeArray* array :
+             {&largeTables, &largePieces, &largeRows, &largeRowLengths, &largeAtoms, &largeJoints, &largeJointLengths,
+              &largeMultipliers, &largeFactors, &largeWork, &largeExchange, &largePhases, &largeIterations})
+            kernel->addArg(*array);
+    };
+    addEmpty(created.finishLarge,
+             9); // step, firstStage, endStage, isLast, stamp, kick, isFormed, isStored, numProjections
+    addEmpty(created.finishLarge, 1); // control
+    created.finishLarge->addArg(settingsArray);
+    created.finishLarge->addArg(partials);
+    created.finishLarge->addArg(numPartials);
+    addState(created.finishLarge);
+
+    if (created.tryLarge) {
+        addEmpty(created.tryLarge, 6); // step, firstStage, endStage, isLast, stamp, tolerance
+        created.tryLarge->addArg(settingsArray);
+        addEmpty(created.tryLarge, 2); // the next trial and its sums
+        created.tryLarge->addArg(numPartials);
+        addState(created.tryLarge);
+    }
+
+    addEmpty(created.advanceLarge, 7); // step, firstStage, endStage, isLast, stamp, tolerance, nextControl
+    created.advanceLarge->addArg(oldPositions);
+    created.advanceLarge->addArg(oldVelocities);
+    addState(created.advanceLarge);
+}
+
 // A placeholder needs the exact type.
 void DeviceSteps::setMixed(ComputeKernel& kernel, int index, double value) {
     if (isMixed)
@@ -210,7 +322,25 @@ void DeviceSteps::setWide(ComputeKernel& kernel, int index, double value) {
 }
 
 void DeviceSteps::launch(ComputeKernel& kernel) {
-    kernel->execute(numGroups * StepProgram::GROUP_SIZE, StepProgram::GROUP_SIZE);
+    kernel->execute(numGroups * groupSize, groupSize);
+    numLaunches++;
+}
+
+// All stages of the large clusters: in one launch, or one after the other.
+void DeviceSteps::launchLarge(ComputeKernel& kernel, int step, int numStages) {
+    const int numPieces = (int) large.getPieces().size();
+    const int numAtOnce = large.getForm().isStaged ? 1 : numStages;
+    numLargeLaunches++;
+    kernel->setArg(0, step);
+    kernel->setArg(4, (int) ((unsigned) numLargeLaunches * STAMPS & 0x7fffffffu));
+    for (int stage = 0; stage < numStages; stage += numAtOnce) {
+        kernel->setArg(1, stage);
+        kernel->setArg(2, stage + numAtOnce);
+        kernel->setArg(3, (int) (stage + numAtOnce == numStages));
+        kernel->execute(std::min(numPieces, context.getNumThreadBlocks()) * large.getNumThreads(),
+                        large.getNumThreads());
+        numLaunches++;
+    }
 }
 
 void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStored) {
@@ -220,15 +350,26 @@ void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStor
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control[half]);
     launch(kernels.finish);
+    if (large.isEmpty())
+        return;
+    const bool isRefined = settings.tolerance < SINGLE_PROJECTION && !context.getUseDoublePrecision() && isMixed;
+    const int numProjections = isRefined ? 2 : 1;
+    setMixed(kernels.finishLarge, 5, kick);
+    kernels.finishLarge->setArg(6, (int) isFormed);
+    kernels.finishLarge->setArg(7, (int) isStored);
+    kernels.finishLarge->setArg(8, numProjections);
+    kernels.finishLarge->setArg(9, control[half]);
+    launchLarge(kernels.finishLarge, step, numProjections + (program->hasHalfSums() ? 3 : 2));
 }
 
 void DeviceSteps::launchEvaluate(int step, bool isRescaled) {
     kernels.evaluate->setArg(0, step);
     kernels.evaluate->setArg(1, (int) isRescaled);
     setWide(kernels.evaluate, 2, groupEnergy);
-    kernels.evaluate->setArg(3, numGroups);
+    kernels.evaluate->setArg(3, numPartials);
     kernels.evaluate->setArg(4, control[half]);
-    kernels.evaluate->execute(StepProgram::GROUP_SIZE, StepProgram::GROUP_SIZE);
+    kernels.evaluate->execute(groupSize, groupSize);
+    numLaunches++;
 }
 
 bool DeviceSteps::begin(const State& state, double energy) {
@@ -277,23 +418,34 @@ void DeviceSteps::advance(double maxStep) {
             kernels.trial->setArg(1, i);
             setWide(kernels.trial, 2, groupEnergy);
             setMixed(kernels.trial, 3, settings.tolerance);
-            kernels.trial->setArg(4, numGroups);
+            kernels.trial->setArg(4, numPartials);
             kernels.trial->setArg(5, control[half]);
             kernels.trial->setArg(8, trials[i % 2]);
             kernels.trial->setArg(9, trialPartials[i % 2]);
             kernels.trial->setArg(10, trials[(i + 1) % 2]);
             kernels.trial->setArg(11, trialPartials[(i + 1) % 2]);
             launch(kernels.trial);
+            if (!large.isEmpty()) {
+                setMixed(kernels.tryLarge, 5, settings.tolerance);
+                kernels.tryLarge->setArg(7, trials[(i + 1) % 2]);
+                kernels.tryLarge->setArg(8, trialPartials[(i + 1) % 2]);
+                launchLarge(kernels.tryLarge, stepNumber, MAX_STAGES + 1);
+            }
         }
     kernels.advance->setArg(0, stepNumber);
     setWide(kernels.advance, 1, groupEnergy);
     setWide(kernels.advance, 2, std::min(maxStep, NO_LIMIT));
     setMixed(kernels.advance, 3, settings.tolerance);
-    kernels.advance->setArg(4, numGroups);
+    kernels.advance->setArg(4, numPartials);
     kernels.advance->setArg(5, control[half]);
     kernels.advance->setArg(6, control[1 - half]);
     launch(kernels.advance);
     half = 1 - half;
+    if (!large.isEmpty()) {
+        setMixed(kernels.advanceLarge, 5, settings.tolerance);
+        kernels.advanceLarge->setArg(6, control[half]);
+        launchLarge(kernels.advanceLarge, stepNumber, MAX_STAGES);
+    }
 }
 
 void DeviceSteps::finish(double energy) {
@@ -378,5 +530,10 @@ long long DeviceSteps::getNumIterations() {
         return 0;
     vector<int> counts;
     iterationCounts.download(counts);
+    if (!large.isEmpty()) {
+        vector<int> largeCounts;
+        largeIterations.download(largeCounts);
+        counts.insert(counts.end(), largeCounts.begin(), largeCounts.end());
+    }
     return *std::max_element(counts.begin(), counts.end());
 }

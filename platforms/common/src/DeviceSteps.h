@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_DEVICESTEPS_H_
 
 #include "ClusterKinds.h"
+#include "LargeClusters.h"
 #include "StepProgram.h"
 #include "expressions/ExpressionGroup.h"
 #include "openmm/common/ComputeArray.h"
@@ -50,7 +51,7 @@ public:
     };
 
     /** Whether all constraints are of those that the device can solve. */
-    static bool canTake(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
+    static bool canTake(const std::vector<ExpressionConstraint>& expressions);
     DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system);
     /** Take over settings, after which begin() is due. */
     void setSettings(const Settings& settings);
@@ -84,17 +85,29 @@ public:
     bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
     long long getNumIterations();
+    const LargeClusters& getLargeClusters() const {
+        return large;
+    }
+    /** Launches since the beginning. */
+    long long getNumLaunches() const {
+        return numLaunches;
+    }
 
 private:
+    DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters);
     struct Kernels {
         OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
+        OpenMM::ComputeKernel finishLarge, tryLarge, advanceLarge;
     };
     void initialize();
     void compile(StepProgram::Update update);
+    void initializeLarge();
     void setArguments(Kernels& created);
+    void setLargeArguments(Kernels& created);
     void setMixed(OpenMM::ComputeKernel& kernel, int index, double value);
     void setWide(OpenMM::ComputeKernel& kernel, int index, double value);
     void launch(OpenMM::ComputeKernel& kernel);
+    void launchLarge(OpenMM::ComputeKernel& kernel, int step, int numStages);
     void launchFinish(int step, double kick, bool isFormed, bool isStored);
     void launchEvaluate(int step, bool isRescaled);
     bool hasChangeFailed();
@@ -103,16 +116,24 @@ private:
     void fill(Report& report);
     OpenMM::ComputeContext& context;
     std::vector<ClusterKind> kinds;
+    LargeClusters large;
     Settings settings;
     std::unique_ptr<StepProgram> program;
     bool isMixed, isWide; // mixed is double; there are doubles
-    int numGroups;  // of work, each of which leaves its sums
+    int groupSize;
+    int numGroups;   // of work, each of which leaves its sums
+    int numPartials; // with the pieces of large clusters, which leave theirs behind
+    int numLargeLaunches;
+    long long numLaunches;
     int half;       // the control block that is in force
     int stepNumber; // of the last advance()
     double groupEnergy;
     double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
     OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2];
     OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts;
+    OpenMM::ComputeArray largeTables, largePieces, largeRows, largeRowLengths, largeAtoms, largeJoints,
+        largeJointLengths;
+    OpenMM::ComputeArray largeMultipliers, largeFactors, largeWork, largeExchange, largePhases, largeIterations;
     std::map<std::string, Kernels> compiled; // by what the text depends on
     Kernels kernels;
 };

@@ -18,6 +18,8 @@ using std::vector;
 namespace {
 
 const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
+// Of a group that waits for others, about 0.2 s; they come within microseconds.
+const int MAX_POLLS = 1 << 18;
 
 void replaceAll(string& text, const string& from, const string& to) {
     for (size_t at = text.find(from); at != string::npos; at = text.find(from, at + to.size()))
@@ -123,14 +125,16 @@ bool StepProgram::usesSpeeds(const vector<StepMonitor::Term>& terms) {
     return std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return isOfSpeeds(term.kind); });
 }
 
-StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMonitor::Term>& terms, Update update,
-                         bool isMixed, bool isWide) : update(update) {
+StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& large,
+                         const vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide) :
+        update(update) {
     writeMonitors(terms);
     writeClusters(kinds);
+    writeLargeClusters(large);
     source = DeviceSources::step;
     for (const auto& word : words)
         replaceAll(source, word.first, word.second);
-    const map<string, int> numbers = {{"GROUP_SIZE", GROUP_SIZE},
+    const map<string, int> numbers = {{"GROUP_SIZE", getGroupSize(!large.isEmpty())},
                                       {"FIXED", Fixed},
                                       {"SUM", Sum},
                                       {"BOUNDED", Bounded},
@@ -186,6 +190,8 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const vector<StepMoni
     defines["WIDE"] = isWide ? "double" : "float";
     // A float has lost the sign of a pivot below this fraction.
     defines["MIN_PIVOT"] = isMixed ? literal(ConstraintMatrix::MIN_RELATIVE_PIVOT) : "1e-5f";
+    // Of large clusters, whose factor is in the type of forces.
+    defines["MIN_LARGE_PIVOT"] = "(sizeof(real) > 4 ? " + literal(ConstraintMatrix::MIN_RELATIVE_PIVOT) + "f : 1e-5f)";
     defines["SLOPE_ROUNDING"] = isMixed ? "1e-11" : "1e-4f";
     defines["MARGIN"] = "0.1f";
     defines["SLOW_CONVERGENCE"] = "0.25f";
@@ -313,4 +319,21 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
     words["FINISH_CASES"] = finishCases;
     words["TRIAL_CASES"] = trialCases;
     words["ADVANCE_CASES"] = advanceCases;
+}
+
+void StepProgram::writeLargeClusters(const LargeClusters& large) {
+    words["LARGE_CLUSTERS"] = large.isEmpty() ? "" : DeviceSources::large;
+    if (large.isEmpty())
+        return;
+    const LargeClusters::Form& form = large.getForm();
+    const bool hasNarrow = large.getNarrow() > 0;
+    defines["NUM_THREADS"] = to_string(large.getNumThreads());
+    defines["USE_RECORDS"] = form.areRecords ? "1" : "0";
+    defines["HAS_JOINTS"] = form.hasJoints ? "1" : "0";
+    defines["IN_LOCAL_MEMORY"] = form.isInLocalMemory ? "1" : "0";
+    defines["MEMORY"] = form.isInLocalMemory ? "LOCAL_ARG" : "GLOBAL";
+    defines["SHARED_SIZE"] = to_string(form.isInLocalMemory ? large.getLocalSize() : 1);
+    defines["NARROW"] = hasNarrow ? to_string(large.getNarrow()) : "NUM_THREADS";
+    defines["SYNC_NARROW"] = hasNarrow ? "__syncwarp()" : "SYNC_PIECE";
+    defines["MAX_POLLS"] = to_string(form.isStaged ? 1 : MAX_POLLS);
 }

@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_STEPPROGRAM_H_
 
 #include "ClusterKinds.h"
+#include "LargeClusters.h"
 #include "step/StepDensity.h"
 #include "step/StepMonitor.h"
 #include <map>
@@ -59,17 +60,22 @@ public:
     struct Place {
         int firstSlot, firstAtom, firstLength;
     };
-    static const int GROUP_SIZE = 64, SLOT_UNIT = 32;
+    static const int SLOT_UNIT = 32;
 
     /**
-     * @param kinds         the clusters
+     * @param kinds         the clusters that one thread can have
+     * @param large         the others
      * @param terms         the monitors
      * @param update        how the density is found
      * @param isMixed       whether positions and velocities are in double precision
      * @param isWide        whether the device has doubles
      */
-    StepProgram(const std::vector<ClusterKind>& kinds, const std::vector<StepMonitor::Term>& terms, Update update,
-                bool isMixed, bool isWide);
+    StepProgram(const std::vector<ClusterKind>& kinds, const LargeClusters& large,
+                const std::vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide);
+    /** The threads of a work group. */
+    static int getGroupSize(bool hasLargeClusters) {
+        return hasLargeClusters ? 128 : 64;
+    }
     /** The update as a device sees it: what does not depend on velocities needs no iteration. */
     static Update updateOf(const std::vector<StepMonitor::Term>& terms, bool isFixedStep, StepDensity::Update update);
     /** Whether the monitors depend on the velocities themselves, and not through the multipliers alone. */
@@ -99,6 +105,7 @@ public:
 private:
     void writeMonitors(const std::vector<StepMonitor::Term>& terms);
     void writeClusters(const std::vector<ClusterKind>& kinds);
+    void writeLargeClusters(const LargeClusters& large);
     std::string source;
     std::map<std::string, std::string> defines, words;
     std::vector<Place> places;

@@ -2,7 +2,8 @@
 // SPDX-License-Identifier: MIT
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
-// with graphs "common" (hydrogens on heavy atoms, rigid water) or "all" (of up to eight constraints, the densest among them).
+// with graphs "common" (hydrogens on heavy atoms, rigid water), "all" (of up to eight constraints, the densest among them), "large" (a
+// long chain too, in pieces that wait for each other), or "dense" (many bonds on one particle).
 
 #include "StepProgram.h"
 #include "TestSupport.h"
@@ -14,7 +15,7 @@ using std::vector;
 
 int main(int argc, char** argv) {
     if (argc != 5) {
-        std::cerr << "PrintKernels <precision> <monitor> <update> common|all" << std::endl;
+        std::cerr << "PrintKernels <precision> <monitor> <update> common|all|large|dense" << std::endl;
         return 2;
     }
     const string precision = argv[1], graphs = argv[4];
@@ -41,9 +42,18 @@ int main(int argc, char** argv) {
         add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}, {0, 7}, {0, 8}});
         add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {1, 2}, {2, 3}, {3, 4}, {4, 1}});
     }
+    vector<std::pair<int, int>> bonds;
+    for (int i = 0; i < 400; i++)
+        bonds.emplace_back(graphs == "large" ? i : 0, i + 1);
+    if (graphs == "large" || graphs == "dense")
+        add(bonds);
     const vector<StepMonitor::Term> terms = {{(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1}};
     const StepDensity::Update update = (StepDensity::Update) std::stoi(argv[3]);
-    const StepProgram program(ClusterKinds::find(system), terms, StepProgram::updateOf(terms, false, update),
+    const ClusterKinds kinds(system);
+    const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
+    const LargeClusters large(kinds.large,
+                              {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 64});
+    const StepProgram program(kinds.small, large, terms, StepProgram::updateOf(terms, false, update),
                               precision != "single", true);
     for (const auto& define : program.getDefines())
         std::cout << "#define " << define.first << " " << define.second << "\n";

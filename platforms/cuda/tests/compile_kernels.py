@@ -24,6 +24,10 @@ CASES = (
     ("single", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
     ("double", MULTIPLIER_P_NORM, SEMI_EXPLICIT, "common", ("sm_90",)),
     ("mixed", MULTIPLIER_P_NORM, EXPLICIT, "all", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_70", "sm_90")),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "large", ("sm_70", "sm_90")),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "dense", ("sm_90",)),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.
@@ -42,6 +46,7 @@ PRELUDE = """
 #define NUM_GROUPS gridDim.x
 #define SYNC_THREADS __syncthreads();
 typedef long long mm_long;
+typedef unsigned long long mm_ulong;
 typedef REAL real;
 typedef REAL4 real4;
 typedef MIXED mixed;
@@ -103,7 +108,7 @@ def main(print_kernels: str) -> int:
             )
             assert {"finishStep", "advanceStep"} <= {kernel[0] for kernel in kernels}, report
             for name, stack, spills, registers in kernels:
-                failed = graphs == "common" and (int(stack) > 0 or int(spills) > 0)
+                failed = graphs != "all" and (int(stack) > 0 or int(spills) > 0)
                 num_failed += failed
                 print(
                     f"{'FAILED' if failed else 'passed'}: {precision} update {update} {graphs} {architecture} {name}: "

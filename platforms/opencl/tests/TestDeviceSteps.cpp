@@ -60,8 +60,10 @@ struct Molecules {
     vector<DistanceConstraint> constraints;
     std::mt19937 random;
 
+    OpenMM::CustomExternalForce* field;
+
     explicit Molecules(int copies) : random(7) {
-        auto* field = new OpenMM::CustomExternalForce("200*(x^2+y^2+z^2)+80*cos(9*x)*sin(7*y+5*z)");
+        field = new OpenMM::CustomExternalForce("200*(x^2+y^2+z^2)+80*cos(9*x)*sin(7*y+5*z)");
         auto* bonds = new OpenMM::HarmonicBondForce();
         const vector<vector<std::pair<int, int>>> graphs = {
             {{0, 1}, {0, 2}, {1, 2}},                                                         // water
@@ -97,6 +99,32 @@ struct Molecules {
         wells->setForceGroup(1); // of the monitor
         for (OpenMM::Force* force : std::initializer_list<OpenMM::Force*>{field, bonds, wells})
             system.addForce(force);
+    }
+    // A molecule of many bonds, each particle beside one to which it is bound, or where it is given.
+    void addLarge(const vector<std::pair<int, int>>& bonds, double lightest = 1, const vector<Vec3>& places = {}) {
+        int numAtoms = 0;
+        for (const auto& bond : bonds)
+            numAtoms = std::max(numAtoms, std::max(bond.first, bond.second) + 1);
+        const int first = system.getNumParticles();
+        std::uniform_real_distribution<double> uniform(-1, 1);
+        for (int i = 0; i < numAtoms; i++) {
+            Vec3 place = places.empty() ? Vec3() : places[i];
+            for (const auto& bond : bonds)
+                if (places.empty() && std::max(bond.first, bond.second) == i) {
+                    const Vec3 other = positions[first + std::min(bond.first, bond.second)];
+                    Vec3 step;
+                    do {
+                        step = Vec3(uniform(random), uniform(random), uniform(random));
+                        step *= 0.13 / std::sqrt(step.dot(step));
+                        place = other + step;
+                    } while (place.dot(place) > 1);
+                    break;
+                }
+            addParticle(i % 3 == 1 ? lightest : 12.0 + i % 10, place);
+            field->addParticle(first + i);
+        }
+        for (const auto& bond : bonds)
+            addConstraint(first + bond.first, first + bond.second);
     }
     void addParticle(double mass, const Vec3& position) {
         std::normal_distribution<double> normal(0, mass > 0 ? std::sqrt(2.5 / mass) : 0.0);
@@ -218,9 +246,8 @@ vector<StepMonitor::Term> allMonitors() {
 }
 
 // From a state in the middle of a run: the first step, and 20, of which the last is cut short.
-void testStepsAgree(const std::string& precision, const vector<StepDensity::Update>& updates, double distance,
-                    double fraction) {
-    const Molecules molecules(2);
+void testStepsAgree(const Molecules& molecules, const std::string& precision,
+                    const vector<StepDensity::Update>& updates, double distance, double fraction) {
     Both both(molecules, precision);
     for (StepDensity::Update update : updates) {
         both.start(molecules, update, allMonitors());
@@ -241,6 +268,191 @@ void testStepsAgree(const std::string& precision, const vector<StepDensity::Upda
         }
         ASSERT(both.device.getNumIterations() >= 20);
     }
+}
+
+typedef vector<std::pair<int, int>> Bonds;
+
+Bonds makeChain(int length) {
+    Bonds bonds;
+    for (int i = 0; i < length; i++)
+        bonds.emplace_back(i, i + 1);
+    return bonds;
+}
+
+Bonds makeRing(int length) {
+    Bonds bonds = makeChain(length - 1);
+    bonds.emplace_back(length - 1, 0);
+    return bonds;
+}
+
+Bonds makeStar(int numArms, int length) {
+    Bonds bonds;
+    for (int i = 0; i < numArms * length; i++)
+        bonds.emplace_back(i % length == 0 ? 0 : i, i + 1);
+    return bonds;
+}
+
+// A molecule like a protein: a backbone with side groups, each with a ring of five, and hydrogens.
+Bonds makeProtein(int numResidues) {
+    Bonds bonds;
+    int next = 1, last = 0;
+    auto add = [&](int to) {
+        bonds.emplace_back(to, next);
+        return next++;
+    };
+    for (int i = 0; i < numResidues; i++) {
+        const int alpha = add(last), carbonyl = add(alpha);
+        add(alpha);
+        add(carbonyl);
+        const int first = add(alpha), second = add(first), third = add(second), fourth = add(third),
+                  fifth = add(fourth);
+        bonds.emplace_back(first, fifth);
+        for (int atom : {second, third, fourth})
+            add(atom);
+        last = add(carbonyl);
+    }
+    return bonds;
+}
+
+// The lattice of diamond, of so many cells along each edge.
+Bonds makeDiamond(int edge, vector<Vec3>& places) {
+    const double a = 0.3567;
+    places.clear();
+    for (int x = 0; x < 4 * edge; x++)
+        for (int y = 0; y < 4 * edge; y++)
+            for (int z = 0; z < 4 * edge; z++)
+                if ((x % 2 == y % 2 && y % 2 == z % 2) && (x + y + z) % 4 < 2)
+                    places.push_back(Vec3(x, y, z) * (a / 4));
+    Bonds bonds;
+    for (int i = 0; i < (int) places.size(); i++)
+        for (int j = 0; j < i; j++) {
+            const Vec3 r = places[i] - places[j];
+            if (r.dot(r) < 0.2 * a * a)
+                bonds.emplace_back(i, j);
+        }
+    return bonds;
+}
+
+Molecules makeMolecules(const vector<Bonds>& large) {
+    Molecules molecules(1);
+    for (const Bonds& bonds : large)
+        molecules.addLarge(bonds);
+    return molecules;
+}
+
+const vector<StepDensity::Update> UPDATES = {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded};
+
+void testDiamond() {
+    vector<Vec3> places;
+    const Bonds bonds = makeDiamond(2, places);
+    Molecules molecules(1);
+    molecules.addLarge(bonds, 12, places);
+    testStepsAgree(molecules, "double", {StepDensity::Explicit}, 1e-12, 1e-9);
+}
+
+// How the work is divided, which no result shows.
+void testDivision() {
+    const Molecules molecules = makeMolecules({makeProtein(60), makeChain(130), makeChain(1500)});
+    LargeClusters::Limits limits = {128, 40 * 1024, 132, 32, 8, 4, 64};
+    const ClusterKinds kinds(molecules.system);
+    const LargeClusters waiting(kinds.large, limits);
+    ASSERT(waiting.getForm().areRecords && waiting.getForm().isInLocalMemory && waiting.getForm().hasJoints);
+    ASSERT(!waiting.getForm().isStaged);
+    ASSERT(waiting.getNumLevels() <= 9);
+    ASSERT(waiting.getNumJointLevels() <= 6);
+    ASSERT(waiting.getNumJoints() <= 25); // about one for each piece
+    ASSERT(16 * waiting.getLocalSize() <= 30 * 1024);
+    // Each constraint is counted by one piece, each particle belongs to one.
+    vector<int> counts(waiting.getNumConstraints(), 0), owners(molecules.masses.size(), 0);
+    for (const LargeClusters::Row& row : waiting.getRows())
+        if (row.number >= 0)
+            counts[row.number]++;
+    for (int atom : waiting.getAtoms())
+        owners[atom]++;
+    ASSERT(std::all_of(counts.begin(), counts.end(), [](int count) { return count == 1; }));
+    for (const LargeClusters::Row& row : waiting.getRows())
+        ASSERT(owners[row.atom1] == 1 && owners[row.atom2] == 1);
+    limits.numResident = 0;
+    const LargeClusters staged(kinds.large, limits);
+    ASSERT(staged.getForm().isStaged && !staged.getForm().isInLocalMemory && staged.getForm().areRecords);
+    // Few processors get larger pieces.
+    limits.numResident = 14;
+    const LargeClusters few(kinds.large, limits);
+    ASSERT(!few.getForm().isStaged && few.getPieces().size() <= 15);
+    // What is dense is left whole.
+    const Molecules star = makeMolecules({makeStar(60, 1)});
+    const LargeClusters dense(ClusterKinds(star.system).large, limits);
+    ASSERT(!dense.getForm().areRecords && !dense.getForm().hasJoints && !dense.getForm().isInLocalMemory);
+}
+
+// The launches of a step, and the iterations.
+void testNumLaunches() {
+    for (int length : {20, 400}) {
+        const Molecules molecules = makeMolecules({makeChain(length)});
+        Both both(molecules, "double");
+        both.start(molecules, StepDensity::Explicit, allMonitors());
+        const bool isStaged = length == 400;
+        ASSERT_EQUAL(isStaged, both.device.getLargeClusters().getForm().isStaged);
+        const long long before = both.device.getNumLaunches(), iterations = both.device.getNumIterations();
+        for (int i = 0; i < 10; i++)
+            both.stepOnDevice();
+        ASSERT_EQUAL(10 * (2 + (isStaged ? 3 + 16 : 2)), both.device.getNumLaunches() - before);
+        ASSERT(!both.device.read().hasFailed);
+        const double perStep = (double) (both.device.getNumIterations() - iterations) / 10;
+        ASSERT(perStep >= 1 && perStep <= 8);
+    }
+}
+
+// A chain of light and heavy particles, bent and straight: to the tolerance.
+void testLightAndHeavy(const std::string& precision) {
+    Molecules molecules(1);
+    const size_t first = molecules.masses.size();
+    molecules.addLarge(makeChain(300));
+    vector<Vec3> straight;
+    for (int i = 0; i <= 30; i++)
+        straight.push_back(Vec3(0.13 * i - 2, 0.01 * std::sin(i), 0.01 * std::cos(2 * i)));
+    molecules.addLarge(makeChain(30), 1, straight);
+    for (size_t i = first; i < molecules.masses.size(); i++) {
+        molecules.masses[i] = i % 2 == 0 ? 126 : 1;
+        molecules.system.setParticleMass((int) i, molecules.masses[i]);
+        molecules.velocities[i] *= 0.2;
+    }
+    Both both(molecules, precision);
+    both.start(molecules, StepDensity::Explicit, allMonitors());
+    both.settings.tolerance = 1e-8;
+    both.handOver();
+    for (int i = 0; i < 20; i++)
+        both.stepOnDevice();
+    ASSERT(!both.device.read().hasFailed);
+    const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+    for (const DistanceConstraint& constraint : molecules.constraints) {
+        const Vec3 r = positions[constraint.particle1] - positions[constraint.particle2];
+        const Vec3 v = velocities[constraint.particle1] - velocities[constraint.particle2];
+        ASSERT_EQUAL_TOL(constraint.length, std::sqrt(r.dot(r)), 1e-8);
+        ASSERT(std::fabs(r.dot(v)) <= 1e-6 * constraint.length);
+    }
+}
+
+// Constraints that depend on each other are noticed, as are those of small clusters.
+void testDependentConstraints(const std::string& precision) {
+    Molecules molecules = makeMolecules({makeChain(400)});
+    const int first = (int) molecules.masses.size() - 401;
+    // Three particles on a line, all distances given.
+    molecules.positions[first + 399] = (molecules.positions[first + 398] + molecules.positions[first + 400]) * 0.5;
+    molecules.addConstraint(first + 398, first + 400);
+    for (int k : {398, 399}) {
+        const Vec3 r = molecules.positions[first + k] - molecules.positions[first + k + 1];
+        const int constraint = molecules.system.getNumConstraints() - 401 + k;
+        molecules.system.setConstraintParameters(constraint, first + k, first + k + 1, std::sqrt(r.dot(r)));
+    }
+    Lender lender;
+    Context context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}});
+    DeviceSteps device(lender.getDevice(), molecules.system);
+    device.setSettings({0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-6, {}});
+    context.setPositions(molecules.positions);
+    context.setVelocities(molecules.velocities);
+    lender.getContext().calcForcesAndEnergy(true, false, 1);
+    ASSERT(!device.begin({1, 0, false, 0}, 0));
 }
 
 // Velocities that have been changed are projected, and the density keeps its ratio to u.
@@ -325,18 +537,8 @@ void testFailureLeavesTheStateBefore(const std::string& precision) {
 
 // Which constraints the device solves, and which are left to the host.
 void testWhatItTakes() {
-    System system;
-    for (int i = 0; i < 10; i++) {
-        ASSERT_EQUAL(i <= 9, DeviceSteps::canTake(system, {}));
-        system.addParticle(12);
-        if (i > 0)
-            system.addConstraint(i - 1, i, 0.1);
-    }
-    ASSERT(!DeviceSteps::canTake(system, {}));
-    System sphere;
-    sphere.addParticle(1);
-    ASSERT(DeviceSteps::canTake(sphere, {}));
-    ASSERT(!DeviceSteps::canTake(sphere, {{"x1^2+y1^2+z1^2-1", {0}, {}}}));
+    ASSERT(DeviceSteps::canTake({}));
+    ASSERT(!DeviceSteps::canTake({{"x1^2+y1^2+z1^2-1", {0}, {}}}));
 }
 
 } // namespace
@@ -346,11 +548,39 @@ int main(int argc, char** argv) {
     TestList tests = {
         {"steps agree, double",
          [] {
-             testStepsAgree("double", {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded}, 1e-12,
-                            1e-9);
+             testStepsAgree(Molecules(2), "double",
+                            {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded}, 1e-12, 1e-9);
          }},
-        {"steps agree, mixed", [] { testStepsAgree("mixed", {StepDensity::SemiExplicit}, 1e-9, 1e-6); }},
-        {"steps agree, single", [] { testStepsAgree("single", {StepDensity::SemiExplicit}, 1e-6, 1e-4); }},
+        {"steps agree, mixed", [] { testStepsAgree(Molecules(2), "mixed", {StepDensity::SemiExplicit}, 1e-9, 1e-6); }},
+        {"steps agree, single",
+         [] { testStepsAgree(Molecules(2), "single", {StepDensity::SemiExplicit}, 1e-6, 1e-4); }},
+        {"large clusters agree, double",
+         [] { testStepsAgree(makeMolecules({makeChain(20), makeProtein(8)}), "double", UPDATES, 1e-12, 1e-9); }},
+        {"large clusters in pieces agree, double",
+         [] {
+             testStepsAgree(
+                 makeMolecules({makeRing(30), makeChain(400), makeRing(300), makeProtein(30), makeStar(4, 60)}),
+                 "double", UPDATES, 1e-12, 1e-9);
+         }},
+        {"large clusters in pieces agree, mixed",
+         [] {
+             testStepsAgree(makeMolecules({makeRing(30), makeProtein(30)}), "mixed", {StepDensity::SemiExplicit}, 1e-9,
+                            1e-6);
+         }},
+        {"large clusters in pieces agree, single",
+         [] {
+             testStepsAgree(makeMolecules({makeRing(30), makeProtein(30)}), "single", {StepDensity::SemiExplicit}, 1e-6,
+                            1e-4);
+         }},
+        {"stars agree, double",
+         [] { testStepsAgree(makeMolecules({makeStar(40, 1), makeChain(20)}), "double", UPDATES, 1e-12, 1e-9); }},
+        {"diamond agrees, double", testDiamond},
+        {"light and heavy particles, double", [] { testLightAndHeavy("double"); }},
+        {"light and heavy particles, mixed", [] { testLightAndHeavy("mixed"); }},
+        {"dependent constraints, double", [] { testDependentConstraints("double"); }},
+        {"dependent constraints, mixed", [] { testDependentConstraints("mixed"); }},
+        {"division into pieces", testDivision},
+        {"launches", testNumLaunches},
         {"changed velocities", testChangedVelocities},
         {"a failure leaves the state before, double", [] { testFailureLeavesTheStateBefore("double"); }},
         {"a failure leaves the state before, single", [] { testFailureLeavesTheStateBefore("single"); }},

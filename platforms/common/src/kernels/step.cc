@@ -204,7 +204,7 @@ CLUSTER_FUNCTIONS
  * on-step ones. Without isStored the velocities are left as they are.
  */
 KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
-        GLOBAL mixed* RESTRICT partials, STATE_PARAMETERS) {
+        GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     const mixed dt = (mixed) control[STEP_SIZE];
     // After a shortened step the half-step velocities are formed anew, as those of a step of the density that goes on.
@@ -232,13 +232,13 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
     mergeInGroup(sums, buffer);
     if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
-            partials[j*NUM_GROUPS + GROUP_ID] = sums[j];
+            partials[j*numPartials + GROUP_ID] = sums[j];
 #if HALF_SUMS
     SYNC_THREADS;
     mergeInGroup(halfSums, buffer);
     if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
-            partials[(NUM_SUMS + j)*NUM_GROUPS + GROUP_ID] = halfSums[j];
+            partials[(NUM_SUMS + j)*numPartials + GROUP_ID] = halfSums[j];
 #endif
 }
 
@@ -352,7 +352,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
     mergeInGroup(sums, buffer);
     if (LOCAL_ID == 0)
         for (int j = 0; j < NUM_SUMS; j++)
-            nextPartials[j*NUM_GROUPS + GROUP_ID] = sums[j];
+            nextPartials[j*numPartials + GROUP_ID] = sums[j];
 }
 
 #endif
@@ -434,3 +434,5 @@ KERNEL void restoreState(int numAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4
             velm[i] = oldVelocities[i];
         }
 }
+
+LARGE_CLUSTERS

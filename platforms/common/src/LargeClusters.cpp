@@ -1,0 +1,589 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#include "LargeClusters.h"
+#include "constraints/ClusterCut.h"
+#include "constraints/EliminationOrder.h"
+#include <algorithm>
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <set>
+
+using namespace OpenMMVRattle;
+using std::map;
+using std::pair;
+using std::vector;
+
+namespace {
+
+// The numbers at the beginning of a piece's tables; kernels/large.cc has the same. Offsets are counted in items of the list.
+enum Header {
+    NumLevels,
+    NumWide,
+    NumCouplings,
+    Couplings,
+    IncidenceStart,
+    IncidenceList,
+    LevelStarts,
+    More, // with records
+    Borders,
+    JointLevelStarts,
+    JointMore,
+    SourceStart,
+    Sources,
+    NumJointLevels,
+    NumJointEntries,
+    NumBorderEntries,
+    FirstContribution,
+    FirstBorderEntry,
+    ColumnStart = More, // with rows
+    EntryRow,
+    EntryColumn,
+    RowStart,
+    RowEntry,
+    RowColumn,
+    Ends = FirstBorderEntry + 1,
+    HEADER_SIZE = 20
+};
+
+const int LARGEST_INDEX = 65535, LARGEST_TABLE = 1 << 18; // bytes
+const int MANY_JOINTS = 1024;
+// A cluster of so many pieces is left whole, unless it does not fit into local memory.
+const double WHOLE = 2.5;
+
+int roundUp(size_t value, int unit) {
+    return (int) ((value + unit - 1) / unit * unit);
+}
+
+// Lists of 16-bit and 32-bit numbers behind each other.
+class Writer {
+public:
+    explicit Writer(bool isShort) : words(HEADER_SIZE, 0), isShort(isShort) {
+    }
+    int addWords(const vector<int>& items) {
+        const size_t start = words.size();
+        words.insert(words.end(), items.begin(), items.end());
+        return (int) start;
+    }
+    // Of numbers that are short with records.
+    int addIndices(const vector<int>& items) {
+        if (!isShort)
+            return addWords(items);
+        const size_t start = words.size();
+        for (size_t i = 0; i < items.size(); i += 2)
+            words.push_back((unsigned) items[i] | (i + 1 < items.size() ? (unsigned) items[i + 1] << 16 : 0));
+        return (int) (2 * start);
+    }
+    // Returns the number of the first, counted in records.
+    int addRecord(const vector<int>& items) {
+        const size_t start = words.size();
+        for (int i = 0; i < 8; i += 2) {
+            auto item = [&](int j) { return j < (int) items.size() ? (unsigned) items[j] : 0; };
+            words.push_back(item(i) | item(i + 1) << 16);
+        }
+        return (int) (start / 4);
+    }
+    int getNextRecord() const {
+        return (int) (words.size() / 4);
+    }
+    void set(Header field, int value) {
+        words[field] = (unsigned) value;
+    }
+    const vector<unsigned>& finish() {
+        words.resize(roundUp(words.size(), 4));
+        return words;
+    }
+
+private:
+    vector<unsigned> words;
+    bool isShort;
+};
+
+} // namespace
+
+// The elimination of the rows of a sparse matrix, outer rows excepted.
+struct LargeClusters::Elimination {
+    int size, numOuter, numLevels;
+    vector<int> order, places;    // row of each place, and back; outer rows are behind
+    vector<int> levels;           // the first place of each level
+    vector<vector<int>> columns;  // the places below the diagonal of each column of L, sorted
+    vector<int> columnStart;      // entries before each column
+    vector<pair<int, int>> outer; // entries between outer rows, by places
+    map<pair<int, int>, int> outerSlots;
+
+    Elimination(int size, int numOuter, const MatrixEntries& entries) : size(size), numOuter(numOuter) {
+        const EliminationOrder found = findEliminationRounds(size, entries, numOuter);
+        order = found.rows;
+        numLevels = found.numLevels;
+        for (int row = size; row < size + numOuter; row++)
+            order.push_back(row);
+        places.resize(order.size());
+        for (size_t place = 0; place < order.size(); place++)
+            places[order[place]] = (int) place;
+        for (int place = 0; place < size; place++)
+            for (; (int) levels.size() <= found.levels[place];)
+                levels.push_back(place);
+        levels.push_back(size);
+        findColumns(entries);
+    }
+    void findColumns(const MatrixEntries& entries) {
+        columns.resize(size);
+        std::set<pair<int, int>> between;
+        auto add = [&](int a, int b) {
+            if (std::min(a, b) < size)
+                columns[std::min(a, b)].push_back(std::max(a, b));
+            else
+                between.insert({std::max(a, b), std::min(a, b)});
+        };
+        for (const auto& entry : entries)
+            add(places[entry.first], places[entry.second]);
+        columnStart.push_back(0);
+        for (int place = 0; place < size; place++) {
+            vector<int>& column = columns[place];
+            std::sort(column.begin(), column.end());
+            column.erase(std::unique(column.begin(), column.end()), column.end());
+            columnStart.push_back(columnStart.back() + (int) column.size());
+            if (column.empty())
+                continue;
+            // What this elimination joins; of inner rows the first one hands it on.
+            const int parent = column[0];
+            if (parent < size)
+                columns[parent].insert(columns[parent].end(), column.begin() + 1, column.end());
+            const auto firstOuter = std::lower_bound(column.begin(), column.end(), size);
+            for (auto a = firstOuter; a != column.end(); ++a)
+                for (auto b = firstOuter; b != a; ++b)
+                    between.insert({*a, *b});
+        }
+        for (const auto& entry : between) {
+            outerSlots[entry] = size + numOuter + columnStart.back() + (int) outer.size();
+            outer.push_back(entry);
+        }
+    }
+    int getNumRows() const {
+        return size + numOuter;
+    }
+    int getNumEntries() const {
+        return columnStart.back();
+    }
+    int getFirstOuterSlot() const {
+        return getNumRows() + getNumEntries();
+    }
+    // Where the entry of two places is kept.
+    int findSlot(int row, int column) const {
+        if (column >= size)
+            return outerSlots.at({row, column});
+        const vector<int>& list = columns[column];
+        return getNumRows() + columnStart[column] +
+               (int) (std::lower_bound(list.begin(), list.end(), row) - list.begin());
+    }
+    bool isNarrow() const {
+        return std::all_of(columns.begin(), columns.end(),
+                           [](const vector<int>& column) { return column.size() < EliminationOrder::WIDE; });
+    }
+
+    // The records of all levels, pass by pass; see applyRecord() in kernels/large.cc. Returns where each level's begin.
+    vector<int> writeRecords(Writer& writer, int narrow, vector<int>& more, int& numWide) const {
+        typedef vector<vector<int>> Level; // records
+        vector<Level> passes[3];
+        for (int level = 0; level < numLevels; level++) {
+            map<int, vector<int>> entries, right; // for each number the products that are subtracted from it
+            Level backward;
+            for (int k = levels[level]; k < levels[level + 1]; k++) {
+                const vector<int>& column = columns[k];
+                const int first = getNumRows() + columnStart[k], count = (int) column.size();
+                for (int a = 0; a < count; a++) {
+                    auto product = [&](int target, int b) {
+                        entries[target].insert(entries[target].end(), {first + a, first + b, k});
+                    };
+                    right[column[a]].insert(right[column[a]].end(), {first + a, k});
+                    product(column[a], a);
+                    for (int b = 0; b < a; b++)
+                        product(findSlot(column[a], column[b]), b);
+                }
+                vector<int> record = {k, count, first};
+                record.insert(record.end(), column.begin(), column.begin() + (count > 5 ? 3 : count));
+                if (count > 5)
+                    addMore(record, more, column, 3);
+                backward.push_back(record);
+            }
+            passes[0].push_back(makeLevel(entries, 3, 2, 1, more));
+            passes[1].push_back(makeLevel(right, 2, 3, 2, more));
+            passes[2].push_back(backward);
+        }
+        std::reverse(passes[2].begin(), passes[2].end());
+        numWide = numLevels;
+        auto isNarrowLevel = [&](int level) {
+            return (int) std::max({passes[0][level].size(), passes[1][level].size(),
+                                   passes[2][numLevels - 1 - level].size()}) <= narrow;
+        };
+        while (numWide > 0 && isNarrowLevel(numWide - 1))
+            numWide--;
+        vector<int> starts;
+        for (const vector<Level>& pass : passes) {
+            for (const Level& level : pass) {
+                starts.push_back(writer.getNextRecord());
+                for (const vector<int>& record : level)
+                    writer.addRecord(record);
+            }
+            starts.insert(starts.end(), 2, writer.getNextRecord());
+        }
+        return starts;
+    }
+    static void addMore(vector<int>& record, vector<int>& more, const vector<int>& items, int first) {
+        record.resize(6, 0);
+        record.push_back((int) more.size() & 65535);
+        record.push_back((int) more.size() >> 16);
+        more.insert(more.end(), items.begin() + first, items.end());
+    }
+    // Records of numbers to which products of so many factors belong; those with as many products are neighbours.
+    static vector<vector<int>> makeLevel(const map<int, vector<int>>& targets, int numFactors, int numWithin,
+                                         int numBeforeMore, vector<int>& more) {
+        vector<pair<int, const vector<int>*>> sorted;
+        for (const auto& target : targets)
+            sorted.emplace_back(target.first, &target.second);
+        std::stable_sort(sorted.begin(), sorted.end(),
+                         [](const auto& a, const auto& b) { return a.second->size() < b.second->size(); });
+        vector<vector<int>> level;
+        for (const auto& target : sorted) {
+            const vector<int>& factors = *target.second;
+            const int count = (int) factors.size() / numFactors, within = count > numWithin ? numBeforeMore : count;
+            vector<int> record = {target.first, count};
+            record.insert(record.end(), factors.begin(), factors.begin() + within * numFactors);
+            if (count > numWithin)
+                addMore(record, more, factors, within * numFactors);
+            level.push_back(record);
+        }
+        return level;
+    }
+};
+
+// One piece of a cluster, by places of the kind.
+struct LargeClusters::Layout {
+    vector<int> constraints; // inner ones, then borders
+    vector<int> particles;
+    int numInner;
+    vector<unsigned> tables;
+    int numKept, factorSize, workSize;
+    int firstContribution;
+};
+
+LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& limits) :
+        form(), numThreads(limits.numThreads), narrow(limits.narrow) {
+    size_t total = 0;
+    for (const ClusterKind& kind : kinds)
+        if ((double) kind.pairs.size() > WHOLE * limits.pieceSize)
+            total += kind.pairs.size() * kind.atoms.size();
+    int pieceSize = limits.pieceSize;
+    if (limits.numResident > 0)
+        pieceSize = std::max(pieceSize, (int) (1.1 * (double) total / limits.numResident));
+    clear();
+    form.areRecords = true;
+    bool areRecords = true;
+    for (const ClusterKind& kind : kinds)
+        areRecords = areRecords && addKind(kind, limits, pieceSize);
+    if (!areRecords) {
+        clear();
+        form.areRecords = false;
+        for (const ClusterKind& kind : kinds)
+            addKind(kind, limits, 0);
+    }
+    form.hasJoints = numJoints > 0;
+    const auto isJoined = [](const Piece& piece) { return piece.numJoints > 0; };
+    form.isStaged =
+        form.hasJoints && std::count_if(pieces.begin(), pieces.end(), isJoined) > std::max(limits.numResident, 0);
+    form.isInLocalMemory = form.areRecords && !form.isStaged && 16 * localSize <= limits.localMemory;
+    if (form.isInLocalMemory) {
+        numFactors = numWork = 0;
+        for (Piece& piece : pieces) {
+            piece.firstKept = (int) numFactors;
+            numFactors += piece.numKept;
+            piece.firstWork = 0;
+        }
+    }
+    // What is loaded in advance of need may lie behind the end.
+    tables.resize(tables.size() + 4 * (size_t) (limits.numThreads + 1), 0);
+}
+
+void LargeClusters::clear() {
+    form = Form();
+    pieces.clear();
+    tables.clear();
+    rows.clear();
+    joints.clear();
+    rowLengths.clear();
+    jointLengths.clear();
+    atoms.clear();
+    numConstraints = localSize = numLevels = numJoints = numJointLevels = 0;
+    numFactors = numWork = numWords = numEntries = 0;
+}
+
+// Returns false if lists of records would be too long for it.
+bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int pieceSize) {
+    const int count = (int) kind.pairs.size();
+    vector<vector<int>> particlesOf;
+    for (const auto& pair : kind.pairs)
+        particlesOf.push_back({pair.first, pair.second});
+    ClusterCut cut;
+    const size_t size = pieceSize;
+    if (pieceSize > 0 && count > WHOLE * size)
+        cut = cutClusterAlongTree(particlesOf, pieceSize);
+    if (cut.pieces.size() < 2) {
+        cut = ClusterCut();
+        cut.pieces.resize(1);
+        for (int i = 0; i < kind.numAtoms; i++)
+            cut.pieces[0].particles.push_back(i);
+        for (int k = 0; k < count; k++)
+            cut.pieces[0].constraints.push_back(k);
+    }
+    const int numPieceJoints = (int) cut.joints.size();
+    if (numPieceJoints > MANY_JOINTS)
+        return false;
+    vector<int> pieceOf(kind.numAtoms), placeOf(kind.numAtoms);
+    for (size_t p = 0; p < cut.pieces.size(); p++)
+        for (size_t i = 0; i < cut.pieces[p].particles.size(); i++) {
+            pieceOf[cut.pieces[p].particles[i]] = (int) p;
+            placeOf[cut.pieces[p].particles[i]] = (int) i;
+        }
+
+    // Each piece alone; its joints are its outer rows.
+    struct Part {
+        vector<int> borders; // numbers of joints
+        vector<vector<int>> constraintsOf; // of each particle, by numbers of rows before the elimination
+        std::unique_ptr<Elimination> elimination;
+        map<pair<int, int>, vector<int>>
+            couplings; // between rows: the particle's place, twice, + 1 where the signs differ
+    };
+    vector<Part> parts(cut.pieces.size());
+    for (int j = 0; j < numPieceJoints; j++)
+        for (int i : particlesOf[cut.joints[j]])
+            parts[pieceOf[i]].borders.push_back(j);
+    MatrixEntries jointEntries;
+    for (size_t p = 0; p < parts.size(); p++) {
+        Part& part = parts[p];
+        vector<int>& inner = cut.pieces[p].constraints;
+        const int numInner = (int) inner.size(), numBorders = (int) part.borders.size();
+        part.constraintsOf.resize(cut.pieces[p].particles.size());
+        auto constraintOf = [&](int row) {
+            return row < numInner ? inner[row] : cut.joints[part.borders[row - numInner]];
+        };
+        for (int row = 0; row < numInner + numBorders; row++)
+            for (int i : particlesOf[constraintOf(row)])
+                if (pieceOf[i] == (int) p)
+                    part.constraintsOf[placeOf[i]].push_back(row);
+        MatrixEntries entries;
+        for (size_t i = 0; i < part.constraintsOf.size(); i++)
+            for (int a : part.constraintsOf[i])
+                for (int b : part.constraintsOf[i])
+                    if (a > b) {
+                        const int particle = cut.pieces[p].particles[i];
+                        const bool differs = (particlesOf[constraintOf(a)][0] == particle) !=
+                                             (particlesOf[constraintOf(b)][0] == particle);
+                        entries.emplace_back(a, b);
+                        part.couplings[{a, b}].push_back(2 * (int) i + differs);
+                    }
+        part.elimination.reset(new Elimination(numInner, numBorders, entries));
+        const Elimination& elimination = *part.elimination;
+        if (form.areRecords && (!elimination.isNarrow() ||
+                                elimination.getFirstOuterSlot() + (int) elimination.outer.size() > LARGEST_INDEX - 8))
+            return false;
+        for (const auto& entry : elimination.outer)
+            jointEntries.emplace_back(part.borders[elimination.order[entry.first] - numInner],
+                                      part.borders[elimination.order[entry.second] - numInner]);
+    }
+    for (auto& entry : jointEntries)
+        entry = {std::max(entry.first, entry.second), std::min(entry.first, entry.second)};
+    std::sort(jointEntries.begin(), jointEntries.end());
+    jointEntries.erase(std::unique(jointEntries.begin(), jointEntries.end()), jointEntries.end());
+    std::unique_ptr<Elimination> joined;
+    if (numPieceJoints > 0)
+        joined.reset(new Elimination(numPieceJoints, 0, jointEntries));
+    const int numJointEntries = joined == nullptr ? 0 : joined->getNumEntries();
+    if (joined != nullptr && (!joined->isNarrow() || numPieceJoints + numJointEntries > LARGEST_INDEX))
+        return false;
+
+    // What the joints' matrix is the sum of: each piece sends its diagonal entries, then those between its joints.
+    vector<vector<int>> sources(numPieceJoints + numJointEntries);
+    vector<Layout> layouts(parts.size());
+    int numContributions = 0;
+    for (size_t p = 0; p < parts.size(); p++) {
+        const Part& part = parts[p];
+        const int numInner = part.elimination->size;
+        layouts[p].firstContribution = numContributions;
+        for (int joint : part.borders)
+            sources[joined->places[joint]].push_back(numContributions++);
+        for (const auto& entry : part.elimination->outer) {
+            const int a = joined->places[part.borders[part.elimination->order[entry.first] - numInner]];
+            const int b = joined->places[part.borders[part.elimination->order[entry.second] - numInner]];
+            sources[joined->findSlot(std::max(a, b), std::min(a, b))].push_back(numContributions++);
+        }
+    }
+    if (numContributions > LARGEST_INDEX)
+        return false;
+
+    // The tables.
+    for (size_t p = 0; p < parts.size(); p++) {
+        const Part& part = parts[p];
+        const Elimination& elimination = *part.elimination;
+        Layout& layout = layouts[p];
+        const int numInner = elimination.size, numRows = elimination.getNumRows();
+        const int numBorders = elimination.numOuter, numParticles = (int) cut.pieces[p].particles.size();
+        layout.numInner = numInner;
+        layout.particles = cut.pieces[p].particles;
+        for (int row : elimination.order)
+            layout.constraints.push_back(row < numInner ? cut.pieces[p].constraints[row]
+                                                        : cut.joints[part.borders[row - numInner]]);
+        Writer writer(form.areRecords);
+        writer.set(NumLevels, elimination.numLevels);
+        if (form.areRecords) {
+            vector<int> more;
+            int numWide;
+            const vector<int> starts = elimination.writeRecords(writer, limits.narrow, more, numWide);
+            vector<int> jointMore, jointStarts;
+            int numJointWide = 0;
+            if (joined != nullptr)
+                jointStarts = joined->writeRecords(writer, 0, jointMore, numJointWide);
+            writer.set(NumWide, numWide);
+            writer.set(LevelStarts, writer.addWords(starts));
+            writer.set(More, writer.addIndices(more));
+            if (joined != nullptr) {
+                writer.set(NumJointLevels, joined->numLevels);
+                writer.set(NumJointEntries, numJointEntries);
+                writer.set(JointLevelStarts, writer.addWords(jointStarts));
+                writer.set(JointMore, writer.addIndices(jointMore));
+                vector<int> borders, sourceStart(1, 0), sourceList;
+                for (int joint : part.borders) {
+                    const int side = pieceOf[particlesOf[cut.joints[joint]][0]] == (int) p ? 0 : 1;
+                    borders.push_back(2 * joined->places[joint] + side);
+                }
+                for (const vector<int>& list : sources) {
+                    sourceList.insert(sourceList.end(), list.begin(), list.end());
+                    sourceStart.push_back((int) sourceList.size());
+                }
+                writer.set(Borders, writer.addWords(borders));
+                writer.set(SourceStart, writer.addIndices(sourceStart));
+                writer.set(Sources, writer.addIndices(sourceList));
+                writer.set(NumBorderEntries, (int) elimination.outer.size());
+                writer.set(FirstContribution, layout.firstContribution);
+                writer.set(FirstBorderEntry, elimination.getFirstOuterSlot());
+            }
+        }
+        else {
+            vector<int> entryRow, entryColumn, rowStart(1, 0), rowEntry, rowColumn;
+            vector<vector<int>> entriesOf(numInner);
+            for (int column = 0; column < numInner; column++)
+                for (int row : elimination.columns[column]) {
+                    entriesOf[row].push_back((int) entryRow.size());
+                    entryRow.push_back(row);
+                    entryColumn.push_back(column);
+                }
+            for (const vector<int>& list : entriesOf) {
+                for (int entry : list) {
+                    rowEntry.push_back(numRows + entry);
+                    rowColumn.push_back(entryColumn[entry]);
+                }
+                rowStart.push_back((int) rowEntry.size());
+            }
+            writer.set(LevelStarts, writer.addWords(elimination.levels));
+            writer.set(ColumnStart, writer.addWords(elimination.columnStart));
+            writer.set(EntryRow, writer.addWords(entryRow));
+            writer.set(EntryColumn, writer.addWords(entryColumn));
+            writer.set(RowStart, writer.addWords(rowStart));
+            writer.set(RowEntry, writer.addWords(rowEntry));
+            writer.set(RowColumn, writer.addWords(rowColumn));
+        }
+        vector<int> couplings;
+        for (const auto& coupling : part.couplings) {
+            const int a = elimination.places[coupling.first.first], b = elimination.places[coupling.first.second];
+            couplings.insert(couplings.end(),
+                             {elimination.findSlot(std::max(a, b), std::min(a, b)), a, b, coupling.second[0],
+                              coupling.second.size() > 1 ? coupling.second[1] : -1});
+        }
+        writer.set(NumCouplings, (int) part.couplings.size());
+        writer.set(Couplings, writer.addWords(couplings));
+        vector<int> ends;
+        for (int k : layout.constraints)
+            for (int i : particlesOf[k])
+                ends.push_back(pieceOf[i] == (int) p ? placeOf[i] : -1);
+        writer.set(Ends, writer.addWords(ends));
+        vector<int> incidenceStart(1, 0), incidence;
+        for (int i = 0; i < numParticles; i++) {
+            for (int row : part.constraintsOf[i]) {
+                const int place = elimination.places[row];
+                incidence.push_back(2 * place + (particlesOf[layout.constraints[place]][0] != layout.particles[i]));
+            }
+            incidenceStart.push_back((int) incidence.size());
+        }
+        writer.set(IncidenceStart, writer.addIndices(incidenceStart));
+        writer.set(IncidenceList, writer.addIndices(incidence));
+        layout.tables = writer.finish();
+        if (form.areRecords && 4 * layout.tables.size() > LARGEST_TABLE)
+            return false;
+        const size_t numValues =
+            (size_t) elimination.getFirstOuterSlot() + elimination.outer.size() + (size_t) numBorders * numPieceJoints;
+        layout.numKept = roundUp(numValues + 8, 4);
+        layout.factorSize =
+            roundUp((size_t) layout.numKept + 4 * numRows + 2 * numPieceJoints + numJointEntries + 8, 4);
+        layout.workSize = roundUp((size_t) 5 * numInner + numRows + 7 * numParticles + 7 * numPieceJoints, 4);
+        numLevels = std::max(numLevels, elimination.numLevels);
+        numEntries = std::max(numEntries, (size_t) elimination.getNumEntries());
+    }
+    numJoints = std::max(numJoints, numPieceJoints);
+    if (joined != nullptr)
+        numJointLevels = std::max(numJointLevels, joined->numLevels);
+
+    // And for each cluster of the kind.
+    vector<int> firstTable;
+    for (const Layout& layout : layouts) {
+        firstTable.push_back((int) (tables.size() / 4));
+        tables.insert(tables.end(), layout.tables.begin(), layout.tables.end());
+    }
+    for (size_t c = 0; c < kind.atoms.size(); c++) {
+        const int firstJoint = (int) joints.size(), channel = (int) numWords;
+        numWords += (size_t) (limits.mixedSize / 4) * (16 * numPieceJoints + numContributions);
+        for (int place = 0; place < numPieceJoints; place++) {
+            const int k = cut.joints[joined->order[place]];
+            joints.push_back(
+                {kind.atoms[c][kind.pairs[k].first], kind.atoms[c][kind.pairs[k].second], numConstraints + k, 0});
+            jointLengths.push_back(kind.lengths[c][k]);
+        }
+        for (size_t p = 0; p < layouts.size(); p++) {
+            const Layout& layout = layouts[p];
+            const int tableSize = (int) layout.tables.size() / 4, numRows = (int) layout.constraints.size();
+            const int workWords = (layout.workSize * limits.mixedSize + 15) / 16;
+            const int factorWords = (layout.factorSize * limits.realSize + 15) / 16;
+            Piece piece = {firstTable[p],
+                           tableSize,
+                           (int) rows.size(),
+                           layout.numInner,
+                           numRows - layout.numInner,
+                           (int) atoms.size(),
+                           (int) layout.particles.size(),
+                           firstJoint,
+                           numPieceJoints,
+                           (int) numFactors,
+                           layout.numKept,
+                           (int) numWork,
+                           channel,
+                           tableSize,
+                           tableSize + workWords,
+                           0};
+            localSize = std::max({localSize, tableSize + workWords + factorWords, tableSize + limits.numThreads + 1});
+            numFactors += layout.factorSize;
+            numWork += layout.workSize;
+            for (int k : layout.constraints) {
+                const int i = kind.pairs[k].first, j = kind.pairs[k].second;
+                const bool isFirst = pieceOf[i] == (int) p, isSecond = pieceOf[j] == (int) p;
+                const int number = numConstraints + k;
+                rows.push_back({kind.atoms[c][i], kind.atoms[c][j], isFirst ? number : number | INT32_MIN,
+                                (isFirst ? 1 : 0) + (isSecond ? 2 : 0)});
+                rowLengths.push_back(kind.lengths[c][k]);
+            }
+            for (int i : layout.particles)
+                atoms.push_back(kind.atoms[c][i]);
+            pieces.push_back(piece);
+        }
+        numConstraints += count;
+    }
+    return true;
+}

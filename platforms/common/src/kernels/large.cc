@@ -1,0 +1,772 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Large clusters of distance constraints g = (|r|^2 - L^2)/2, in pieces: a work group eliminates the constraints within a piece, and
+// what is left are the joints, the constraints between pieces of one cluster (LargeClusters.h). K = G M^-1 G^T = L D L^T is that of
+// the on-step positions; finish makes it, and the steps from there use it again.
+//
+// All that is done is a sequence of stages, each with one solution K x = b: the velocities' projection, Lambda, Lambda at the
+// half-step velocities, or an iteration for the positions. In a stage a group sets up its right-hand sides, eliminates, and sends to
+// the others what its joints need; in the next one it takes what the others have sent, solves for the joints, and substitutes. So
+// groups meet once in a stage. Either each waits for the others, with all stages in one launch, or each stage is a launch of its own.
+//
+// NUM_THREADS threads have a piece. MEMORY is where a piece has its numbers and tables: local memory, or global memory if they do not fit, or if they must
+// outlive a launch.
+
+// Where a processor is the device, one thread has a piece.
+#if NUM_THREADS == 1
+#define THREAD 0
+#define SYNC_PIECE
+#define MERGE_SUMS(sums)
+#define LARGE_MEMORY LOCAL uint4 shared[SHARED_SIZE]; LOCAL int flags[2];
+#else
+#define THREAD LOCAL_ID
+#define SYNC_PIECE SYNC_THREADS
+#define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
+#define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 shared[SHARED_SIZE]; LOCAL int flags[2];
+#endif
+
+#define FINISH 0
+#define ADVANCE 1
+#define TRY 2
+
+// What the solution under way is for.
+#define POSITIONS 0
+#define VELOCITIES 1
+#define MULTIPLIERS 2
+#define HALF_MULTIPLIERS 3
+#define COMPLETE 4
+#define NUM_PHASES 5
+
+#define FACTORIZE 0
+#define FORWARD 1
+#define BACKWARD 2
+
+#define IS_OWN(row) ((row).z >= 0)
+#define NUMBER_OF(row) ((row).z & 0x7fffffff)
+#define LOW(word) ((int) ((word) & 65535u))
+#define HIGH(word) ((int) ((word) >> 16))
+#define WORDS_PER_VALUE ((int) (sizeof(mixed)/4))
+
+typedef unsigned int word_t;
+#if USE_RECORDS
+typedef unsigned short index_t;
+#else
+typedef unsigned int index_t;
+#endif
+typedef union {
+    mixed value;
+    word_t words[2];
+} SentValue;
+
+#if USE_RECORDS
+
+// An elimination by levels from records of 16 bytes, one for each number that a level changes. All levels of a pass are in one list.
+// Entries of L are A[numRows], ...; its diagonal is D at first, then 1/D.
+
+/** One record. Values of no use are loaded all the same: of record 0, so that no load waits for a condition. */
+inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_t* more, MEMORY real* A, MEMORY real* x) {
+    const int target = LOW(record.x), count = HIGH(record.x);
+    if (pass == FACTORIZE) { // A[t] -= A[a] A[b]/A[k]
+        const word_t last = (count == 2 ? record.w : 0);
+        const int a = LOW(record.y), b = HIGH(record.y), k = LOW(record.z), c = HIGH(record.z), d = LOW(last), l = HIGH(last);
+        real value = A[target], first = A[a]*A[b]/A[k], second = A[c]*A[d]/A[l];
+        value -= first;
+        if (count == 2)
+            value -= second;
+        int at = (int) record.w;
+        for (int i = 1; i < (count > 2 ? count : 0); i++, at += 3)
+            value -= A[more[at]]*A[more[at+1]]/A[more[at+2]];
+        A[target] = value;
+    }
+    else if (pass == FORWARD) { // x[t] -= A[a] x[k]
+        const word_t last = (count == 3 ? record.w : 0);
+        real value = x[target];
+        const real first = A[LOW(record.y)]*x[HIGH(record.y)], second = A[LOW(record.z)]*x[HIGH(record.z)], third = A[LOW(last)]*x[HIGH(last)];
+        value -= first;
+        if (count > 1)
+            value -= second;
+        if (count == 3)
+            value -= third;
+        int at = (int) record.w;
+        for (int i = 2; i < (count > 3 ? count : 0); i++, at += 2)
+            value -= A[more[at]]*x[more[at+1]];
+        x[target] = value;
+    }
+    else { // x[k] = x[k]/D[k] - sum A[a + i] x[rows[i]]
+        const int a = LOW(record.y);
+        const word_t last = (count > 5 ? 0 : record.w);
+        real value = x[target]*A[target];
+        const real first = A[a]*x[HIGH(record.y)], second = A[a+1]*x[LOW(record.z)], third = A[a+2]*x[HIGH(record.z)];
+        const real fourth = A[a+3]*x[LOW(last)], fifth = A[a+4]*x[HIGH(last)];
+        if (count > 0)
+            value -= first;
+        if (count > 1)
+            value -= second;
+        if (count > 2)
+            value -= third;
+        if (count == 4 || count == 5)
+            value -= fourth;
+        if (count == 5)
+            value -= fifth;
+        const int at = (int) record.w;
+        for (int i = 3; i < (count > 5 ? count : 0); i++)
+            value -= A[a+i]*x[more[at+i-3]];
+        x[target] = value;
+    }
+}
+
+/** Some levels of a pass, by so many threads: few need no barrier of the whole group. */
+#define RUN_LEVELS(FIRST, END, LANES, SYNCHRONIZE) { \
+        int begin = (FIRST < END ? starts[FIRST] : 0), end = (FIRST < END ? starts[FIRST+1] : 0); \
+        uint4 record = records[begin + THREAD]; \
+        for (int level = FIRST; level < END; level++) { \
+            const int next = starts[level+2]; \
+            const uint4 nextRecord = records[end + THREAD]; \
+            for (int i = begin + THREAD; i < (THREAD < LANES ? end : 0); i += LANES) \
+                applyRecord(pass, i < begin + LANES ? record : records[i], more, A, x); \
+            record = nextRecord; \
+            begin = end; \
+            end = next; \
+            SYNCHRONIZE; \
+        } \
+    }
+
+inline DEVICE void runLevels(const int pass, int numLevels, int numWide, MEMORY const int* starts, MEMORY const uint4* records,
+        MEMORY const index_t* more, MEMORY real* A, MEMORY real* x) {
+    if (pass == BACKWARD) {
+        const int numNarrow = (numLevels > numWide ? numLevels - numWide : 0);
+        RUN_LEVELS(0, numNarrow, NARROW, SYNC_NARROW)
+        SYNC_PIECE;
+        RUN_LEVELS(numNarrow, numLevels, NUM_THREADS, SYNC_PIECE)
+    }
+    else {
+        const int last = (numWide < numLevels ? numWide : numLevels);
+        RUN_LEVELS(0, last, NUM_THREADS, SYNC_PIECE)
+        RUN_LEVELS(last, numLevels, NARROW, SYNC_NARROW)
+        SYNC_PIECE;
+    }
+}
+
+/** The same for several right-hand sides. */
+inline DEVICE void runForAll(const int pass, int numLevels, MEMORY const int* starts, MEMORY const uint4* records, MEMORY const index_t* more,
+        MEMORY real* A, MEMORY real* X, int count, int stride) {
+    for (int level = 0; level < numLevels; level++) {
+        const int begin = starts[level], number = (starts[level+1] - begin)*count;
+        for (int i = THREAD; i < number; i += NUM_THREADS)
+            applyRecord(pass, records[begin + i/count], more, A, X + (i%count)*stride);
+        SYNC_PIECE;
+    }
+}
+
+/** From entries L D and D to L and 1/D. Returns false if a pivot is too small a fraction of the diagonal of K. */
+inline DEVICE bool scaleFactor(int numLevels, MEMORY const int* starts, MEMORY const uint4* records, MEMORY real* A, MEMORY const real* diagonal) {
+    bool isRegular = true;
+    const int begin = (numLevels > 0 ? starts[0] : 0), end = (numLevels > 0 ? starts[numLevels] : 0);
+    for (int i = begin + THREAD; i < end; i += NUM_THREADS) {
+        const uint4 record = records[i];
+        const int k = LOW(record.x), count = HIGH(record.x), a = LOW(record.y);
+        const real pivot = A[k], inverse = 1/pivot;
+        isRegular = isRegular && pivot > (real) MIN_LARGE_PIVOT*diagonal[k];
+        for (int j = a; j < a + count; j++)
+            A[j] *= inverse;
+        A[k] = inverse;
+    }
+    return isRegular;
+}
+
+#else
+
+// An elimination by levels from the rows and columns of L: what is too dense for lists of products.
+
+/** sum L[i][k] L[j][k]/D[k] over the entries that two rows have both. */
+inline DEVICE real multiplyRows(MEMORY const int* rowStart, MEMORY const int* rowEntry, MEMORY const int* rowColumn, MEMORY const real* A, int i, int j) {
+    real sum = 0;
+    int p = rowStart[i], q = rowStart[j];
+    const int endP = rowStart[i+1], endQ = rowStart[j+1];
+    for (int n = endP - p + endQ - q; n > 0; n--) {
+        const bool areLeft = (p < endP && q < endQ);
+        const int k = (areLeft ? rowColumn[p] : 0), l = (areLeft ? rowColumn[q] : 1);
+        if (areLeft && k == l)
+            sum += A[rowEntry[p]]*A[rowEntry[q]]/A[k];
+        p += (areLeft && k <= l ? 1 : 0);
+        q += (areLeft && l <= k ? 1 : 0);
+    }
+    return sum;
+}
+
+inline DEVICE void runRows(const int pass, int numRows, int numLevels, MEMORY const int* starts, MEMORY const int* columnStart, MEMORY const int* entryRow,
+        MEMORY const int* entryColumn, MEMORY const int* rowStart, MEMORY const int* rowEntry, MEMORY const int* rowColumn, MEMORY real* A, MEMORY real* x) {
+    for (int number = 0; number < numLevels; number++) {
+        const int level = (pass == BACKWARD ? numLevels - 1 - number : number), begin = starts[level], end = starts[level+1];
+        for (int j = begin + THREAD; j < end; j += NUM_THREADS) {
+            if (pass == FACTORIZE)
+                A[j] -= multiplyRows(rowStart, rowEntry, rowColumn, A, j, j);
+            else if (pass == FORWARD) {
+                real value = x[j];
+                for (int p = rowStart[j]; p < rowStart[j+1]; p++)
+                    value -= A[rowEntry[p]]*x[rowColumn[p]];
+                x[j] = value;
+            }
+            else {
+                real value = x[j]*A[j];
+                for (int p = columnStart[j]; p < columnStart[j+1]; p++)
+                    value -= A[numRows+p]*x[entryRow[p]];
+                x[j] = value;
+            }
+        }
+        const int firstEntry = (pass == FACTORIZE ? columnStart[begin] : 0), endEntry = (pass == FACTORIZE ? columnStart[end] : 0);
+        for (int p = firstEntry + THREAD; p < endEntry; p += NUM_THREADS)
+            A[numRows+p] -= multiplyRows(rowStart, rowEntry, rowColumn, A, entryRow[p], entryColumn[p]);
+        SYNC_PIECE;
+    }
+}
+
+/** From entries L D and D to L and 1/D. Returns false if a pivot is too small a fraction of the diagonal of K. */
+inline DEVICE bool scaleFactor(int numRows, MEMORY const int* columnStart, MEMORY real* entries, MEMORY real* A, MEMORY const real* diagonal) {
+    bool isRegular = true;
+    for (int k = THREAD; k < numRows; k += NUM_THREADS) {
+        const real pivot = A[k], inverse = 1/pivot;
+        isRegular = isRegular && pivot > (real) MIN_LARGE_PIVOT*diagonal[k];
+        for (int p = columnStart[k]; p < columnStart[k+1]; p++)
+            entries[p] *= inverse;
+        A[k] = inverse;
+    }
+    return isRegular;
+}
+
+#endif
+
+// What a group sends to the others of its cluster: each value in words of 64 bits, whose upper half is a stamp of the stage. So a
+// value is there when its stamp is, with no fence and no atomic operation. The highest bit of a stamp says that the sender has not
+// converged. There are two sets of words, for even and odd stages: nobody is two stages ahead.
+
+inline DEVICE void sendValue(GLOBAL volatile mm_ulong* words, int stride, mixed value, word_t stamp) {
+    SentValue sent;
+    sent.value = value;
+    for (int i = 0; i < WORDS_PER_VALUE; i++)
+        words[i*stride] = (mm_ulong) stamp << 32 | sent.words[i];
+}
+
+/** Wait for some values; returns whether their sender has converged, which it has not if they do not come. */
+inline DEVICE bool receiveValues(const int count, GLOBAL volatile const mm_ulong* words, int stride, word_t stamp, mixed* values) {
+    mm_ulong word[8*WORDS_PER_VALUE];
+    bool isComplete = false;
+    for (int poll = 0; poll < MAX_POLLS && !isComplete; poll++) {
+        isComplete = true;
+        UNROLL for (int i = 0; i < count*WORDS_PER_VALUE; i++)
+            word[i] = words[i*stride];
+        UNROLL for (int i = 0; i < count*WORDS_PER_VALUE; i++)
+            isComplete = isComplete && ((word_t) (word[i] >> 32) & 0x7fffffffu) == stamp;
+    }
+    bool isConverged = isComplete;
+    UNROLL for (int i = 0; i < count; i++) {
+        SentValue received;
+        UNROLL for (int j = 0; j < WORDS_PER_VALUE; j++) {
+            received.words[j] = (word_t) word[i*WORDS_PER_VALUE+j];
+            isConverged = isConverged && (word[i*WORDS_PER_VALUE+j] >> 63) == 0;
+        }
+        values[i] = received.value;
+    }
+    return isConverged;
+}
+
+#define LARGE_PARAMETERS GLOBAL const uint4* RESTRICT allTables, GLOBAL const int4* RESTRICT pieces, GLOBAL const int4* RESTRICT rows, GLOBAL const mixed* RESTRICT rowLengths, \
+        GLOBAL const int* RESTRICT pieceAtoms, GLOBAL const int4* RESTRICT joints, GLOBAL const mixed* RESTRICT jointLengths, \
+        GLOBAL mixed* RESTRICT largeMultipliers, GLOBAL real* RESTRICT factors, GLOBAL mixed* RESTRICT work, GLOBAL volatile mm_ulong* RESTRICT exchange, GLOBAL int* RESTRICT phases, \
+        GLOBAL int* RESTRICT largeIterations
+#define LARGE_ARGUMENTS allTables, pieces, rows, rowLengths, pieceAtoms, joints, jointLengths, largeMultipliers, factors, work, exchange, phases, largeIterations
+#define LARGE_STATE_PARAMETERS int paddedNumAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, \
+        GLOBAL const mm_long* RESTRICT force, GLOBAL int* RESTRICT failure
+#define LARGE_STATE_ARGUMENTS paddedNumAtoms, posq, posqCorrection, velm, force, failure
+
+/** What a launch does with a piece. */
+typedef struct {
+    int step, firstStage, endStage;
+    int numProjections;  // solutions for the velocities
+    word_t stamp;        // of stage 0
+    mixed dt;            // of the step; of the kick in finish
+    mixed halfKick;      // to the half-step velocities, where they are formed from the on-step ones
+    int formHalf;
+    int isWritten;       // positions and velocities are changed
+    int canFail;         // failures are written down
+    mixed tolerance;
+} LargeTask;
+
+/**
+ * Stages of a piece. Returns what has been completed: 1 if sums are those of the piece, + 2 if halfSums are, + 4 if the iteration has
+ * not converged in all stages there are.
+ */
+inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARAMETERS, LARGE_STATE_PARAMETERS,
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, mixed* sums, mixed* halfSums, LOCAL_ARG uint4* shared, LOCAL_ARG int* flags) {
+    const int4 first = pieces[4*piece], second = pieces[4*piece+1], third = pieces[4*piece+2], fourth = pieces[4*piece+3];
+    const int firstRow = first.z, numInner = first.w, numBorders = second.x, firstAtom = second.y, numAtoms = second.z, firstJoint = second.w, numJoints = third.x;
+    const int numRows = numInner + numBorders, numKept = third.z;
+    const bool isBeginning = (task.firstStage == 0);
+    GLOBAL real* kept = factors + third.y;
+    GLOBAL volatile mm_ulong* channel = exchange + fourth.x;
+#if IN_LOCAL_MEMORY
+    for (int i = THREAD; i < first.y; i += NUM_THREADS)
+        shared[i] = allTables[first.x+i];
+    MEMORY const uint4* tables = shared;
+    MEMORY mixed* M = (MEMORY mixed*) (shared + fourth.y);
+    MEMORY real* A = (MEMORY real*) (shared + fourth.z);
+    if (mode != FINISH)
+        for (int i = THREAD; i < numKept; i += NUM_THREADS)
+            A[i] = kept[i];
+#else
+    MEMORY const uint4* tables = allTables + first.x;
+    MEMORY mixed* M = work + third.w;
+    MEMORY real* A = kept;
+#endif
+    const int lastPhase = (isBeginning ? 0 : phases[piece]);
+    if (THREAD == 0)
+        flags[0] = flags[1] = lastPhase/NUM_PHASES;
+    int phase = (!isBeginning ? lastPhase%NUM_PHASES : mode == FINISH ? VELOCITIES : POSITIONS);
+
+    // Numbers: the factor A and what the joints need of it, the right-hand side or solution x, the vectors R of the constraints.
+    MEMORY real* x = A + numKept;
+    MEMORY real* R = x + numRows;
+    MEMORY real* jointWeights = R + 3*numRows;
+    // In the type of positions: vectors, constants of the right-hand sides, displacements or velocities D, multipliers.
+    MEMORY mixed* vectors = M;
+    MEMORY mixed* constants = vectors + 3*numInner;
+    MEMORY mixed* pulls = constants + numInner;
+    MEMORY mixed* gamma = pulls + numInner;
+    MEMORY mixed* D = gamma + numRows;
+    MEMORY mixed* W = D + 3*numAtoms;
+    MEMORY mixed* jointVectors = W + numAtoms;
+    MEMORY mixed* jointConstants = jointVectors + 3*numJoints;
+    MEMORY mixed* jointPulls = jointConstants + numJoints;
+    MEMORY mixed* jointRight = jointPulls + numJoints;
+    MEMORY mixed* jointSums = jointRight + numJoints;
+#if HALF_SUMS
+    MEMORY mixed* before = jointSums + numJoints;
+#endif
+
+    // ---------------------------------------------------------------------------------------- the state at the beginning
+    bool isRegular = true; // no constraints that depend on each other, no force that is no number
+    for (int k = THREAD; k < (isBeginning ? numRows : 0); k += NUM_THREADS) {
+        const int4 row = rows[firstRow+k];
+        const mixed length = rowLengths[firstRow+k];
+        mixed x1[3], x2[3], v[3], a1[3], a2[3], r[3], pull = 0;
+        loadPosition(posq, posqCorrection, row.x, x1);
+        loadPosition(posq, posqCorrection, row.y, x2);
+        UNROLL for (int d = 0; d < 3; d++) {
+            r[d] = x1[d] - x2[d];
+            R[3*k+d] = (real) r[d];
+        }
+        const mixed square = dot3(r, r);
+        if (mode != ADVANCE) {
+            const mixed w1 = loadVelocity(velm, row.x, v), w2 = loadVelocity(velm, row.y, v);
+            loadAcceleration(force, paddedNumAtoms, row.x, w1, a1);
+            loadAcceleration(force, paddedNumAtoms, row.y, w2, a2);
+            pull = dot3(r, a1) - dot3(r, a2);
+            if (mode == FINISH) {
+                const mixed own = ((row.w & 1) != 0 ? w1 : (mixed) 0) + ((row.w & 2) != 0 ? w2 : (mixed) 0);
+                A[k] = (real) (own*square);
+                x[k] = A[k];
+            }
+        }
+        if (mode != FINISH) {
+            gamma[k] = -task.dt*task.dt/2*largeMultipliers[NUMBER_OF(row)];
+            x[k] = (real) gamma[k];
+        }
+        if (k < numInner) {
+            UNROLL for (int d = 0; d < 3; d++)
+                vectors[3*k+d] = r[d];
+            constants[k] = (square - length*length)/2;
+            pulls[k] = pull;
+        }
+    }
+    for (int j = THREAD; j < (isBeginning ? numJoints : 0); j += NUM_THREADS) {
+        const int4 joint = joints[firstJoint+j];
+        const mixed length = jointLengths[firstJoint+j];
+        mixed x1[3], x2[3], v[3], a1[3], a2[3], r[3];
+        loadPosition(posq, posqCorrection, joint.x, x1);
+        loadPosition(posq, posqCorrection, joint.y, x2);
+        UNROLL for (int d = 0; d < 3; d++)
+            jointVectors[3*j+d] = r[d] = x1[d] - x2[d];
+        const mixed square = dot3(r, r);
+        jointConstants[j] = (square - length*length)/2;
+        if (mode != ADVANCE) {
+            const mixed w1 = loadVelocity(velm, joint.x, v), w2 = loadVelocity(velm, joint.y, v);
+            loadAcceleration(force, paddedNumAtoms, joint.x, w1, a1);
+            loadAcceleration(force, paddedNumAtoms, joint.y, w2, a2);
+            jointPulls[j] = dot3(r, a1) - dot3(r, a2);
+            jointWeights[j] = (real) ((w1 + w2)*square);
+        }
+    }
+    for (int i = THREAD; i < (isBeginning ? numAtoms : 0); i += NUM_THREADS) {
+        const int atom = pieceAtoms[firstAtom+i];
+        mixed v[3], a[3];
+        W[i] = loadVelocity(velm, atom, v);
+        isRegular = loadAcceleration(force, paddedNumAtoms, atom, W[i], a) >= 0 && isRegular;
+        if (mode == ADVANCE) {
+            mixed p[3];
+            const real charge = loadPosition(posq, posqCorrection, atom, p);
+            oldPositions[atom] = make_mixed4(p[0], p[1], p[2], charge);
+            oldVelocities[atom] = make_mixed4(v[0], v[1], v[2], W[i]);
+        }
+        UNROLL for (int d = 0; d < 3; d++) {
+            D[3*i+d] = (mode == FINISH ? v[d] + task.dt*a[d] : task.dt*(v[d] + task.dt/2*a[d]));
+#if HALF_SUMS
+            if (mode == FINISH)
+                before[3*i+d] = v[d];
+#endif
+        }
+    }
+    if (mode == FINISH)
+        for (int i = numRows + THREAD; i < (isBeginning ? numKept : 0); i += NUM_THREADS)
+            A[i] = 0;
+    SYNC_PIECE;
+    MEMORY const int* header = (MEMORY const int*) tables;
+    MEMORY const index_t* indices = (MEMORY const index_t*) tables;
+    const int numLevels = header[0], numWide = header[1], numCouplings = header[2];
+    MEMORY const int* ends = header + header[18];
+    MEMORY const index_t* incidenceStart = indices + header[4];
+    MEMORY const index_t* incidence = indices + header[5];
+    MEMORY const int* couplings = header + header[3];
+#if USE_RECORDS
+    MEMORY const index_t* more = indices + header[7];
+    MEMORY const int* starts = header + header[6];
+    #define RUN_FACTORIZE(LEVELS) runLevels(FACTORIZE, LEVELS, numWide, starts, tables, more, A, x)
+    #define RUN_FORWARD(LEVELS) runLevels(FORWARD, LEVELS, numWide, starts + numLevels + 2, tables, more, A, x)
+    #define RUN_BACKWARD(LEVELS) runLevels(BACKWARD, LEVELS, numWide, starts + 2*(numLevels + 2), tables, more, A, x)
+#else
+    MEMORY const int* starts = header + header[6];
+    MEMORY const int* columnStart = header + header[7];
+    MEMORY const int* entryRow = header + header[8];
+    MEMORY const int* entryColumn = header + header[9];
+    MEMORY const int* rowStart = header + header[10];
+    MEMORY const int* rowEntry = header + header[11];
+    MEMORY const int* rowColumn = header + header[12];
+    #define RUN_ROWS(PASS, LEVELS) runRows(PASS, numRows, LEVELS, starts, columnStart, entryRow, entryColumn, rowStart, rowEntry, rowColumn, A, x)
+    #define RUN_FACTORIZE(LEVELS) RUN_ROWS(FACTORIZE, LEVELS)
+    #define RUN_FORWARD(LEVELS) RUN_ROWS(FORWARD, LEVELS)
+    #define RUN_BACKWARD(LEVELS) RUN_ROWS(BACKWARD, LEVELS)
+#endif
+#if HAS_JOINTS
+    MEMORY const int* borders = header + header[8];
+    MEMORY const int* jointStarts = header + header[9];
+    MEMORY const index_t* jointMore = indices + header[10];
+    MEMORY const index_t* sourceStart = indices + header[11];
+    MEMORY const index_t* sources = indices + header[12];
+    const int numJointLevels = header[13], numJointEntries = header[14], numBorderEntries = header[15], firstContribution = header[16];
+    const int firstBorderEntry = header[17];
+    MEMORY real* Z = A + firstBorderEntry + numBorderEntries; // this piece's rows of the inverse of the joints' matrix
+    MEMORY real* J = jointWeights + numJoints; // the joints' matrix
+#endif
+
+    // K; its diagonal is there
+    for (int i = THREAD; i < (mode == FINISH && isBeginning ? numCouplings : 0); i += NUM_THREADS) {
+        MEMORY const int* coupling = couplings + 5*i;
+        const int k = coupling[1], l = coupling[2];
+        real weight = 0;
+        UNROLL for (int shared = 3; shared < 5; shared++) {
+            const int code = coupling[shared]; // twice the particle, + 1 where the signs differ; -1 for none
+            const mixed w = W[code < 0 ? 0 : code>>1];
+            weight += (real) (code < 0 ? 0 : (code & 1) != 0 ? -w : w);
+        }
+        A[coupling[0]] = weight*(R[3*k]*R[3*l] + R[3*k+1]*R[3*l+1] + R[3*k+2]*R[3*l+2]);
+    }
+    SYNC_PIECE;
+
+    const int numFresh = (mode == FINISH && isBeginning ? numLevels : 0);
+    RUN_FACTORIZE(numFresh);
+#if USE_RECORDS
+    isRegular = scaleFactor(numFresh, starts + 2*(numLevels + 2), tables, A, x) && isRegular;
+#else
+    isRegular = scaleFactor(numFresh > 0 ? numRows : 0, columnStart, A + numRows, A, x) && isRegular;
+#endif
+#if HAS_JOINTS
+    if (mode == FINISH)
+        for (int i = THREAD; i < (isBeginning ? numBorders + numBorderEntries : 0); i += NUM_THREADS)
+            sendValue(channel + WORDS_PER_VALUE*(16*numJoints + firstContribution + i), 1, A[i < numBorders ? numInner + i : firstBorderEntry + i - numBorders], task.stamp);
+#endif
+
+    // --------------------------------------------------------------------------------------------------------- the stages
+    int completed = 0;
+    for (int stage = task.firstStage; stage < task.endStage && phase != COMPLETE; stage++) {
+        const int now = stage & 1;
+        const bool isUnderWay = (stage > 0);
+        if (THREAD == 0)
+            flags[now] = 0;
+#if HAS_JOINTS
+        // What the others have sent.
+        const word_t lastStamp = task.stamp + (word_t) stage - 1;
+        GLOBAL volatile const mm_ulong* inbox = channel + (now ^ 1)*8*WORDS_PER_VALUE*numJoints;
+        for (int j = THREAD; j < (isUnderWay ? numJoints : 0); j += NUM_THREADS) {
+            mixed sent[8], r[3], s[3];
+            bool isConverged = receiveValues(8, inbox + j, numJoints, lastStamp, sent);
+            UNROLL for (int d = 0; d < 3; d++) {
+                r[d] = jointVectors[3*j+d];
+                s[d] = sent[1+d] - sent[5+d];
+            }
+            const mixed square = dot3(s, s), product = dot3(r, s);
+            const mixed right = (phase == POSITIONS ? -(jointConstants[j] + product + square/2) : phase == VELOCITIES ? -product : square + jointPulls[j]);
+            jointRight[j] = right;
+            jointSums[j] = right + sent[0] + sent[4];
+            if (!isConverged || !(fabs(right) <= task.tolerance*dot3(r, r)))
+                flags[now^1] = 1;
+        }
+        // The joints' matrix, at first.
+        const int isFresh = (mode == FINISH && stage == 1 && numJoints > 0 ? 1 : 0);
+        GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
+        for (int i = THREAD; i < isFresh*(numJoints + numJointEntries); i += NUM_THREADS) {
+            mixed sum = 0;
+            for (int at = sourceStart[i]; at < sourceStart[i+1]; at++) {
+                mixed value;
+                receiveValues(1, contributions + WORDS_PER_VALUE*sources[at], 1, task.stamp, &value);
+                sum += value;
+            }
+            J[i] = (real) sum;
+        }
+        for (int i = THREAD; i < isFresh*numBorders*numJoints; i += NUM_THREADS)
+            Z[i] = ((borders[i/numJoints] >> 1) == i%numJoints ? 1 : 0);
+        SYNC_PIECE;
+        runLevels(FACTORIZE, isFresh*numJointLevels, numJointLevels, jointStarts, tables, jointMore, J, J);
+        isRegular = scaleFactor(isFresh*numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, J, jointWeights) && isRegular;
+        SYNC_PIECE;
+        runForAll(FORWARD, isFresh*numJointLevels, jointStarts + numJointLevels + 2, tables, jointMore, J, Z, numBorders, numJoints);
+        runForAll(BACKWARD, isFresh*numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, jointMore, J, Z, numBorders, numJoints);
+#else
+        SYNC_PIECE;
+#endif
+        const bool isConverged = (phase == POSITIONS && stage > 1 && flags[now^1] == 0);
+        const bool isSolved = (isUnderWay && !isConverged);
+#if HAS_JOINTS
+        for (int b = THREAD; b < (isSolved ? numBorders : 0); b += NUM_THREADS) {
+            mixed sum = 0;
+            for (int j = 0; j < numJoints; j++)
+                sum += Z[b*numJoints+j]*jointSums[j];
+            x[numInner+b] = (real) sum;
+        }
+        SYNC_PIECE;
+#endif
+        RUN_BACKWARD(isSolved ? numLevels : 0);
+        const bool isLastProjection = (phase == VELOCITIES && stage >= task.numProjections);
+        const int nextPhase = (!isUnderWay ? phase :
+                phase == POSITIONS ? (!isConverged ? POSITIONS : mode == TRY ? MULTIPLIERS : COMPLETE) :
+                phase == VELOCITIES ? (isLastProjection ? MULTIPLIERS : VELOCITIES) :
+                phase == MULTIPLIERS && mode == FINISH && HALF_SUMS ? HALF_MULTIPLIERS : COMPLETE);
+        const bool isMeasured = (phase == MULTIPLIERS || phase == HALF_MULTIPLIERS);
+        for (int k = THREAD; k < (isUnderWay ? numRows : 0); k += NUM_THREADS) {
+            if (phase == POSITIONS && !isConverged)
+                gamma[k] += x[k];
+            if (mode == TRY && isConverged) {
+                const int4 row = rows[firstRow+k];
+                if (IS_OWN(row)) // where the next trial starts
+                    largeMultipliers[NUMBER_OF(row)] = -2*gamma[k]/(task.dt*task.dt);
+            }
+            if (mode != ADVANCE && isMeasured) {
+                const int4 row = rows[firstRow+k];
+#if HAS_JOINTS
+                const mixed right = (k < numInner ? constants[k < numInner ? k : 0] : jointRight[k < numInner ? 0 : borders[k-numInner]>>1]);
+#else
+                const mixed right = constants[k];
+#endif
+                if (IS_OWN(row)) {
+                    if (phase == MULTIPLIERS)
+                        addConstraintTerms(sums, (mixed) x[k], right);
+                    else
+                        addConstraintTerms(halfSums, (mixed) x[k], right);
+                    if (mode == FINISH && phase == MULTIPLIERS && task.canFail)
+                        largeMultipliers[NUMBER_OF(row)] = x[k];
+                }
+            }
+        }
+        const bool isMoved = (phase == VELOCITIES ? isUnderWay : phase == POSITIONS && !isConverged);
+        for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
+            real push[3] = {0, 0, 0};
+            for (int at = incidenceStart[i]; at < incidenceStart[i+1]; at++) {
+                const int code = (int) incidence[at], k = code>>1; // of the second particle where it is odd
+                const real factor = ((code & 1) != 0 ? -x[k] : x[k]);
+                UNROLL for (int d = 0; d < 3; d++)
+                    push[d] += factor*R[3*k+d];
+            }
+            mixed v[3];
+            const mixed w = W[i];
+            UNROLL for (int d = 0; d < 3; d++)
+                v[d] = D[3*i+d] + (isMoved ? w*push[d] : (mixed) 0);
+            if (mode != ADVANCE && isMeasured) {
+                mixed a[3];
+                const mixed forceSquared = loadAcceleration(force, paddedNumAtoms, pieceAtoms[firstAtom+i], w, a);
+                if (phase == MULTIPLIERS)
+                    addParticleTerms(sums, forceSquared, w, v);
+                else
+                    addParticleTerms(halfSums, forceSquared, w, v);
+#if HALF_SUMS
+                if (mode == FINISH)
+                    UNROLL for (int d = 0; d < 3; d++)
+                        v[d] = (task.formHalf ? v[d] + task.halfKick*(w*push[d] - a[d]) : before[3*i+d]);
+#endif
+            }
+            if (mode == FINISH && isLastProjection && isUnderWay && task.isWritten)
+                velm[pieceAtoms[firstAtom+i]] = make_mixed4(v[0], v[1], v[2], w);
+            if (mode == ADVANCE && isConverged && task.dt > 0) {
+                const int atom = pieceAtoms[firstAtom+i];
+                mixed p[3];
+                const real charge = loadPosition(posq, posqCorrection, atom, p);
+                storePosition(posq, posqCorrection, atom, p[0] + v[0], p[1] + v[1], p[2] + v[2], charge);
+                velm[atom] = make_mixed4(v[0]/task.dt, v[1]/task.dt, v[2]/task.dt, w);
+            }
+            UNROLL for (int d = 0; d < 3; d++)
+                D[3*i+d] = (mode == TRY && isConverged ? v[d]/task.dt : v[d]);
+        }
+        if (mode == ADVANCE && isConverged && THREAD == 0)
+            largeIterations[piece] += stage - 1;
+        if (mode != ADVANCE && isMeasured)
+            completed |= (phase == MULTIPLIERS ? 1 : 2);
+        phase = nextPhase;
+        SYNC_PIECE;
+
+        // The next right-hand sides.
+        for (int k = THREAD; k < (phase != COMPLETE ? numRows : 0); k += NUM_THREADS) {
+            mixed right = 0;
+            if (k < numInner) {
+                const int i = ends[2*k], j = ends[2*k+1];
+                mixed r[3], s[3];
+                UNROLL for (int d = 0; d < 3; d++) {
+                    r[d] = vectors[3*k+d];
+                    s[d] = D[3*i+d] - D[3*j+d];
+                }
+                const mixed square = dot3(s, s), product = dot3(r, s);
+                if (phase == POSITIONS) {
+                    right = -(constants[k] + product + square/2);
+                    if (!(fabs(right) <= task.tolerance*dot3(r, r)))
+                        flags[now] = 1;
+                }
+                else {
+                    right = (phase == VELOCITIES ? -product : square + pulls[k]);
+                    constants[k] = right;
+                }
+            }
+            x[k] = (real) right;
+        }
+        SYNC_PIECE;
+        // At least one solution, since the multipliers of the state at the beginning are not those of the step.
+        const bool isFine = (phase == POSITIONS && stage > 0 && flags[now] == 0);
+        for (int k = THREAD; k < (isFine ? numInner : 0); k += NUM_THREADS)
+            x[k] = 0;
+        RUN_FORWARD(phase == COMPLETE || isFine ? 0 : numLevels);
+#if HAS_JOINTS
+        const word_t stamp = (task.stamp + (word_t) stage) | (phase == POSITIONS && !isFine ? 0x80000000u : 0u);
+        GLOBAL volatile mm_ulong* outbox = channel + now*8*WORDS_PER_VALUE*numJoints;
+        for (int b = THREAD; b < (phase != COMPLETE ? numBorders : 0); b += NUM_THREADS) {
+            const int joint = borders[b]>>1, side = borders[b] & 1, k = numInner + b, i = (side == 0 ? ends[2*k] : ends[2*k+1]);
+            GLOBAL volatile mm_ulong* words = outbox + side*4*WORDS_PER_VALUE*numJoints + joint;
+            sendValue(words, numJoints, x[k], stamp);
+            UNROLL for (int d = 0; d < 3; d++)
+                sendValue(words + (d + 1)*WORDS_PER_VALUE*numJoints, numJoints, D[3*i+d], stamp);
+        }
+#endif
+    }
+    if (mode == FINISH && !isRegular && task.canFail)
+        fail(failure, task.step, IRREGULAR + NUM_CODES*piece);
+#if IN_LOCAL_MEMORY
+    if (mode == FINISH)
+        for (int i = THREAD; i < numKept; i += NUM_THREADS)
+            kept[i] = A[i];
+    SYNC_PIECE;
+#else
+    if (THREAD == 0)
+        phases[piece] = phase + NUM_PHASES*flags[(task.endStage - 1) & 1];
+#endif
+    return completed | (mode != FINISH && phase != COMPLETE ? 4 : 0);
+}
+
+/** finishStep for the pieces. */
+KERNEL void finishLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed kick, int isFormed, int isStored, int numProjections,
+        GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL mixed* RESTRICT partials, int numPartials, int numPieces,
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
+    mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    const bool isFrozen = (failure[0] != 0);
+    LargeTask task;
+    task.step = step;
+    task.firstStage = firstStage;
+    task.endStage = endStage;
+    task.numProjections = numProjections;
+    task.stamp = (word_t) stamp;
+    task.dt = kick*(mixed) control[STEP_SIZE];
+    task.halfKick = (mixed) (settings[NOMINAL]/(2*control[DENSITY]));
+    task.formHalf = (isFormed || control[IS_SHORTENED] != 0);
+    task.isWritten = (isStored && !isFrozen);
+    task.canFail = !isFrozen;
+    task.tolerance = 0;
+    for (int piece = GROUP_ID; piece < numPieces; piece += NUM_GROUPS) {
+        for (int j = 0; j < NUM_SUMS; j++)
+            sums[j] = halfSums[j] = 0;
+        const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, shared, flags);
+        MERGE_SUMS(sums);
+        if (THREAD == 0 && !isFrozen && (completed & 1) != 0)
+            for (int j = 0; j < NUM_SUMS; j++)
+                partials[j*numPartials + numPartials - numPieces + piece] = sums[j];
+#if HALF_SUMS
+        MERGE_SUMS(halfSums);
+        if (THREAD == 0 && !isFrozen && (completed & 2) != 0)
+            for (int j = 0; j < NUM_SUMS; j++)
+                partials[(NUM_SUMS + j)*numPartials + numPartials - numPieces + piece] = halfSums[j];
+#endif
+    }
+}
+
+#if HALF_SUMS
+
+/** tryStep for the pieces, which takes what that has found of the next trial. */
+KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT settings, GLOBAL const wide* RESTRICT nextTrial,
+        GLOBAL mixed* RESTRICT nextPartials, int numPartials, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
+    mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    LargeTask task;
+    task.step = step;
+    task.firstStage = firstStage;
+    task.endStage = endStage;
+    task.numProjections = 0;
+    task.stamp = (word_t) stamp;
+    task.dt = (mixed) (settings[NOMINAL]/nextTrial[TRIAL_DENSITY]);
+    task.halfKick = 0;
+    task.formHalf = task.isWritten = task.canFail = 0;
+    task.tolerance = tolerance;
+    const int end = (nextTrial[TRIAL_STATUS] == TRYING && !IS_FROZEN(failure, step) ? numPieces : 0);
+    for (int piece = GROUP_ID; piece < end; piece += NUM_GROUPS) {
+        for (int j = 0; j < NUM_SUMS; j++)
+            sums[j] = halfSums[j] = 0;
+        const int completed = runPiece(TRY, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, shared, flags);
+        const bool hasFailed = (isLast && (completed & 4) != 0);
+        if (THREAD == 0 && hasFailed)
+            sums[FAILURES] += 1;
+        MERGE_SUMS(sums);
+        if (THREAD == 0 && ((completed & 1) != 0 || hasFailed))
+            for (int j = 0; j < NUM_SUMS; j++)
+                nextPartials[j*numPartials + numPartials - numPieces + piece] = sums[j];
+    }
+}
+
+#endif
+
+/** advanceStep for the pieces, which takes the step size that that has found. */
+KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions,
+        GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
+    mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    LargeTask task;
+    task.step = step;
+    task.firstStage = firstStage;
+    task.endStage = endStage;
+    task.numProjections = 0;
+    task.stamp = (word_t) stamp;
+    task.dt = (mixed) nextControl[STEP_SIZE];
+    task.halfKick = 0;
+    task.formHalf = 0;
+    task.isWritten = task.canFail = 1;
+    task.tolerance = tolerance;
+    // Only what earlier launches have written may decide, or the groups of one cluster would not agree: this one writes other codes.
+    const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
+    for (int piece = GROUP_ID; piece < (isFrozen ? 0 : numPieces); piece += NUM_GROUPS) {
+        const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, shared, flags);
+        if (THREAD == 0 && isLast && (completed & 4) != 0)
+            fail(failure, step, NOT_CONVERGED + NUM_CODES*piece);
+    }
+}
