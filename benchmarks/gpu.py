@@ -9,8 +9,9 @@ constraints have the tolerance 1e-6 (1e-5 in single precision), for ours 1e-8, t
     python benchmarks/gpu.py [--platform CUDA] [--precision mixed single] [--system water6k water24k villin]
     python benchmarks/gpu.py --data FOLDER --system dhfr dhfr-allbonds
 
-FOLDER has water6k.npz (`pos` and `box`, nm), dhfr.npz (`pos`) and the Systems dhfr.xml.gz (bonds to hydrogen rigid) and
-dhfr_ab.xml.gz (all bonds). Without it boxes of water are made from the force field, and villin takes DHFR's place.
+FOLDER has water6k.npz (`pos` and `box`, nm), dhfr.npz (`pos`) and the Systems dhfr.xml.gz (bonds to hydrogen rigid),
+dhfr_ab.xml.gz (all bonds) and dhfr_ha.xml.gz (angles of hydrogens too). Without it boxes of water are made from the
+force field, and villin takes DHFR's place.
 The same program measures the CPU platform: --platform CPU --threads 16.
 """
 
@@ -100,6 +101,64 @@ def villin(constraints: Any) -> Loaded:
     return system, file.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
 
 
+def chains(are_all_rigid: bool) -> Loaded:
+    """A layer of 128 chains C43H88, each with 130 bonds; those to hydrogen or all of them are rigid."""
+    carbons, spacing, carbon_bond, hydrogen_bond = 43, 0.5, 0.1529, 0.109
+    system, positions = openmm.System(), []
+    nonbonded, bonds, angles = openmm.NonbondedForce(), openmm.HarmonicBondForce(), openmm.HarmonicAngleForce()
+    pairs = []
+
+    def bind(i: int, j: int, length: float) -> None:
+        pairs.append((i, j))
+        if are_all_rigid or length == hydrogen_bond:
+            system.addConstraint(i, j, length)
+        else:
+            bonds.addBond(i, j, length, 224262.4)
+
+    tetrahedral = np.arccos(-1 / 3)
+    up, out = carbon_bond * np.sin(tetrahedral / 2), carbon_bond * np.cos(tetrahedral / 2)
+    side, away = hydrogen_bond * np.sin(tetrahedral / 2), hydrogen_bond * np.cos(tetrahedral / 2)
+    for column, row in np.ndindex(16, 8):
+        last = None
+        for k in range(carbons):
+            place = np.array(((column + 0.5) * spacing, (row + 0.5) * spacing + (k % 2) * out, 0.5 + k * up))
+            outwards = away if k % 2 else -away
+            carbon = system.addParticle(12.011)
+            nonbonded.addParticle(0, 0.35, 0.276)
+            positions.append(place)
+            offsets = [np.array((sign * side, outwards, 0)) for sign in (-1, 1)]
+            if k in (0, carbons - 1):
+                offsets.append(
+                    np.array(
+                        (0, -outwards / away * hydrogen_bond / 3, np.sqrt(8) / 3 * hydrogen_bond * (1 if k else -1))
+                    )
+                )
+            for offset in offsets:
+                hydrogen = system.addParticle(1.008)
+                nonbonded.addParticle(0, 0.25, 0.126)
+                positions.append(place + offset)
+                bind(carbon, hydrogen, hydrogen_bond)
+            if last is not None:
+                bind(last, carbon, carbon_bond)
+            last = carbon
+    neighbours: dict[int, list[int]] = {}
+    for i, j in pairs:
+        neighbours.setdefault(i, []).append(j)
+        neighbours.setdefault(j, []).append(i)
+    for centre, ends in neighbours.items():
+        for n, i in enumerate(ends):
+            for j in ends[:n]:
+                angles.addAngle(i, centre, j, tetrahedral, 350)
+    nonbonded.createExceptionsFromBonds(pairs, 1, 0.5)
+    nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    nonbonded.setCutoffDistance(CUTOFF)
+    for force in (nonbonded, bonds, angles):
+        system.addForce(force)
+    edges = np.array((16 * spacing, 8 * spacing, 1 + carbons * up))
+    system.setDefaultPeriodicBoxVectors(*np.diag(edges))
+    return system, np.array(positions)
+
+
 SYSTEMS: dict[str, Callable[[Path | None], Loaded]] = {
     "water-small": lambda data: water(None, (1, 1, 1), 1.6, 0.7),
     "water6k": lambda data: water(data, (1, 1, 1)),
@@ -107,6 +166,9 @@ SYSTEMS: dict[str, Callable[[Path | None], Loaded]] = {
     "water96k": lambda data: water(data, (4, 2, 2)),
     "dhfr": lambda data: dhfr(data, "dhfr"),
     "dhfr-allbonds": lambda data: dhfr(data, "dhfr_ab"),
+    "dhfr-hangles": lambda data: dhfr(data, "dhfr_ha"),
+    "chains": lambda data: chains(False),
+    "chains-allbonds": lambda data: chains(True),
     "villin": lambda data: villin(app.HBonds),
     "villin-allbonds": lambda data: villin(app.AllBonds),
 }
