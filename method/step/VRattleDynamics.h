@@ -6,12 +6,14 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
-#include "step/AutomaticControl.h"
+#include "step/AutomaticSteps.h"
 #include "step/Dynamics.h"
-#include "step/StepDensity.h"
-#include "step/StepMonitor.h"
+#include "step/MonitorControl.h"
+#include "step/StepSolver.h"
+#include "step/StepState.h"
 #include <functional>
-#include <limits>
+#include <map>
+#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -31,38 +33,8 @@ namespace OpenMMVRattle {
  */
 class VRattleDynamics : public Dynamics {
 public:
-    /** What a user can choose. */
-    struct Settings {
-        double stepSize;                      // the nominal step h (ps)
-        double minimumStep, maximumStep;      // bounds (ps), 0 for none
-        double tolerance;                     // of the constraints, relative
-        StepDensity::Update update;
-        std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
-        bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
-        // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
-        bool isAutomatic = false;
-        double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
-        int automaticRequest = 0; // changes when references in force are to be forgotten
-        int calibrationSteps = 1; // how many steps the references are found from
-    };
-
-    /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
-    struct Memory {
-        bool hasDensity;
-        double density; // rho[n-1/2]
-        std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
-        std::vector<double> parameters,
-            parameterRates; // theta[n] of the expressions, and dtheta/dt of the step to q[n]
-        std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1], in internal order
-        std::vector<double> references; // U_k,ref in force
-        // What could be computed again but for the last bits, which decide whether a restart is exact:
-        std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
-        bool hasHalfStepValue;
-        double u, halfStepValue; // u(q[n],p[n]), u(q[n],p[n-1/2])
-        double rate; // the change of u along F - G^T Lambda
-        double densityOffset; // what (3.14) and (3.15) differed by in the last step
-        AutomaticControl::Memory automatic; // of automatic step control
-    };
+    typedef StepSettings Settings;
+    typedef StepMemory Memory;
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
@@ -105,7 +77,7 @@ public:
         getConstraintSystem().writeParameters(expression, parameters, target);
     }
     const ExpressionParameters& getParameters() const override {
-        return theta;
+        return now.theta;
     }
     void adoptParameters() override;
     /**
@@ -127,8 +99,12 @@ public:
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double density, const double* halfStepValue,
                double offset);
     /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
-    double findHalfStepValue();
-    void setReferences(const std::vector<double>& references) override;
+    double findHalfStepValue() {
+        return monitors.findHalfStepValue();
+    }
+    void setReferences(const std::vector<double>& references) override {
+        control->setReferences(references);
+    }
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
@@ -169,141 +145,76 @@ public:
     void abandonStep() override;
     /** Whether the next step continues a sequence of densities; if not, it is the first one. */
     bool hasStarted() const {
-        return hasDensity;
+        return control->hasStarted();
     }
     /** The state and the references of automatic step control. */
     const AutomaticControl& getAutomaticControl() const {
-        return automatic;
+        return automatic.getControl();
     }
     void reverse() override;
 
     const ConstraintSystem& getConstraintSystem() const override {
-        return solver.getSystem();
+        return constraints.getSystem();
     }
     const std::vector<OpenMM::Vec3>& getPositions() const override {
-        return q;
+        return now.q;
     }
     /** q[n+1], after step(). */
     const std::vector<OpenMM::Vec3>& getNextPositions() const override {
-        return qNext;
+        return solver.next.q;
     }
     const std::vector<OpenMM::Vec3>& getVelocities() const override {
-        return v;
+        return now.v;
     }
     const std::vector<OpenMM::Vec3>& getForces() const override {
-        return force;
+        return now.force;
     }
     double getGroupEnergy() const override {
-        return groupEnergy;
+        return now.groupEnergy;
     }
     /** rho[n-1/2]. */
     double getDensity() const override {
-        return rho;
+        return control->getDensity();
     }
     const std::vector<double>& getMonitorValues() const override {
-        return values;
+        return control->getValues();
     }
     /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
-    std::vector<double> getReferences() const override;
+    std::vector<double> getReferences() const override {
+        return control->getReferences();
+    }
     const std::vector<double>& getMultipliers() const override {
-        return lambda;
+        return now.lambda;
     }
     long long getNumIterations() const override {
-        return solver.getNumIterations() + numNewtonIterations;
+        return solver.getNumIterations();
     }
     long long getNumRescues() const {
-        return numRescues;
+        return control->getNumRescues();
     }
 
 private:
-    enum StepKind { Regular, First, Shortened };
-    void requireConstraintsFor(const std::vector<StepMonitor::Term>& terms) const;
-    bool takeAutomaticReferences(const Settings& newSettings);
-    void setControlSettings();
-    void startAutomatic();
-    void acceptAutomatic();
+    void takeOver(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                  const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     void setMemory(const Memory& memory);
-    void forgetDensity();
-    void rescaleDensity(double oldU);
-    double combineAndLimit(const std::vector<double>& monitorValues) const;
-    bool needsHalfStepValue() const;
-    void beginAt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-                 const std::vector<OpenMM::Vec3>& forces, double energy, const Kept& before);
-    void takeTrialValues();
-
-    void prepareParameters();
-    void setRates(ExpressionParameters& parameters, double size) const;
+    StepControl& controlOf(const Settings& settings);
+    void formHalfStepVelocities();
+    void prepareStep();
     void findJump();
 
-    void ensureMonitor();
-    void formHalfStepVelocities();
-    double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& parameters);
-    void evaluateOnStep(const ConstraintSolver::OnStep& state, double energy, std::vector<double>& monitorValues);
-    double evaluateRate();
-    ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
-    bool solvePositions(const ConstraintSolver::Trial& trial, bool isFromOnStep);
-    bool solveCoupled();
-    bool solveCoupledByNewton();
-    double solveRegular();
-    void keepOffsets();
-    [[noreturn]] void throwNotConverged(const ConstraintSolver::Trial& trial);
-
-    double findFirstDensity();
-    bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double energy, std::vector<double>& backValues);
-    std::vector<double> evaluateHalfSteps();
-    bool startDensityFrom(const std::vector<double>& startValues, const std::vector<double>& backValues, bool hasBack);
-    void scaleReferences(const std::vector<double>& startValues, const std::vector<double>& backValues);
-    static double startValue(double start, double ahead, const double* back);
-
-    ConstraintSolver solver;
-    const ConstraintSystem& system;
-    const std::vector<int>& movingParticles;
-    StepMonitor monitor;
-    StepDensity density;
-    AutomaticControl automatic;
+    StepState now; // between two steps
+    std::vector<double> target; // theta[n+1], what the next step leads to
+    ConstraintSolver constraints;
+    StepSolver solver;
+    MonitorControl monitors;
+    AutomaticSteps automatic;
+    StepControl* control; // the one in force
     Settings settings;
 
-    // The state between two steps.
-    std::vector<OpenMM::Vec3> q, v, w, force;
-    ExpressionParameters theta; // theta[n], with the rates of the step that has led to q[n]
-    std::vector<double> target; // theta[n+1], what the next step leads to
-    double groupEnergy, rho, u;
-    std::vector<double> lambda, rightSide, values; // Lambda, K Lambda and U_k
-    std::vector<double> multiplierOffset; // lambda[n-1] - Lambda[n-1]
-    bool hasDensity, hasHalfStepValue;
-    double halfStepValue, rate; // u(q[n],p[n-1/2]); the change of u along F - G^T Lambda
-    double densityOffset; // what (3.14) and (3.15) differed by in the last step
-    double firstDensity; // of the first step, once it is known; else 0
-    bool isStartedNow; // automatic step control, by the step in progress
-    AutomaticControl::Memory controlBefore; // that
-    bool isCalm; // whether the first step is one that starts no sequence
-    std::vector<char> isNegligible; // each monitor, at the first step
-    std::vector<double> referencesBefore; // the first step, as long as firstDensity is known
-
-    bool isMonitorCurrent; // whether the monitor has the forces at q[n]
-
     // The step in progress.
-    StepKind stepKind;
-    std::vector<OpenMM::Vec3> qNext, wNext, vNext, acceleration, gradient, halfStepChange;
-    double rhoNext, stepNext, kickNext;
-    std::vector<double> parameterChange; // theta[n+1] - theta[n]
-    bool areParametersChanging;
-    // theta[n+1], and theta[n] with the rates of this step, at which (3.14) takes u(q[n],p[n+1/2])
-    ExpressionParameters thetaNext, thetaHalf;
-    double densityScale; // by which u and rho change where the parameters begin to move, or stop
-    bool isJump; // whether that changes the velocities much
-    std::vector<double> lambdaNext, lambdaOnStep, rightSideNext, valuesNext;
+    StepControl::StepKind stepKind;
+    double stepSize;
     ConstraintSolver::HalfStep atHalfStep;
-    std::vector<double> valuesHalf;
-    std::vector<double> multiplierTrial, rightSideTrial, valuesTrial, correction, coupling, response;
-
-    // Work space of the start.
-    std::vector<OpenMM::Vec3> qBack, wBack, vBack, forceBack;
-    ExpressionParameters thetaBack;
-    std::vector<double> lambdaBack, rightSideBack;
-
-    bool isRescued; // by the step in progress
-    long long numNewtonIterations, numRescues; // those of (3.14)
 };
 
 } // namespace OpenMMVRattle

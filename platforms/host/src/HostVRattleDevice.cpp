@@ -80,10 +80,7 @@ void HostVRattleDevice::endTrial() {
 // ------------------------------------------------------------------------------------------------------------- numbers
 
 vector<double> HostVRattleDevice::getMonitorValues() {
-    if (!settings.isAutomatic)
-        return vrattle.getMonitorValues();
-    const AutomaticControl::Memory& memory = vrattle.getAutomaticControl().getMemory();
-    return {std::begin(memory.values), std::end(memory.values)};
+    return vrattle.getMonitorValues();
 }
 
 long long HostVRattleDevice::getNumRescues() {
