@@ -3,6 +3,7 @@
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "openmm/OpenMMException.h"
+#include "openmm/internal/ContextImpl.h"
 #include "run/IntegratorRun.h"
 #include <cmath>
 
@@ -207,6 +208,19 @@ long long VariableStepRattleIntegrator::getNumRescues() const {
 
 long long VariableStepRattleIntegrator::getNumShortSteps() const {
     return run == nullptr ? 0 : run->getDevice().getNumShortSteps();
+}
+
+double VariableStepRattleIntegrator::getUsualStepSize() const {
+    if (run == nullptr)
+        return 0;
+    const OpenMM::System& system = context->getSystem();
+    double lightest = 0;
+    for (int i = 0; i < system.getNumParticles(); i++) {
+        const double mass = system.getParticleMass(i);
+        if (mass > 0 && (lightest == 0 || mass < lightest))
+            lightest = mass;
+    }
+    return 0.001 * std::sqrt(lightest);
 }
 
 void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, const string& name, double value) {

@@ -447,6 +447,7 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
     ForceGroupEnergy: int = vrattle.VariableStepRattleIntegrator.ForceGroupEnergy
 
     _has_warned = False  # of short steps
+    _has_compared = False  # the nominal step size with what is usual
 
     def __init__(
         self,
@@ -542,6 +543,20 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
             the nominal step size in picoseconds
         """
         return unit.Quantity(super().getNominalStepSize(), _TIME)
+
+    def getUsualStepSize(self) -> unit.Quantity:
+        """Get the step size that is usual for the masses of the System: 1 fs for a lightest particle of 1 amu, in
+        proportion to the root of its mass.
+
+        A warning says so once if the nominal step size is less than a thousandth of it at a first step, since it may
+        have been meant as an error tolerance, which is what VariableVerletIntegrator takes.
+
+        Returns
+        -------
+        Quantity
+            the step size in picoseconds; 0 while there is no Context, or if no particle has a mass
+        """
+        return unit.Quantity(super().getUsualStepSize(), _TIME)
 
     def setNominalStepSize(self, size: float | unit.Quantity) -> None:
         """Set the nominal step size: the step taken where the monitor has its reference value.
@@ -1029,6 +1044,7 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
             if there is no Context, or a step cannot be completed; the Context is then in the state before that step
         """
         remaining = integer(steps, "steps")
+        self._compare_with_what_is_usual()
         while self.isAutomatic() and remaining > _MANY_SHORT_STEPS:
             super().step(_MANY_SHORT_STEPS)
             remaining -= _MANY_SHORT_STEPS
@@ -1053,8 +1069,23 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
             if time is not finite, there is no Context, or a step cannot be completed; the Context is then in the state
             before that step
         """
-        super().stepTo(number(time, "time", _TIME))
+        end = number(time, "time", _TIME)
+        self._compare_with_what_is_usual()
+        super().stepTo(end)
         self._warn_of_short_steps()
+
+    def _compare_with_what_is_usual(self) -> None:
+        if self._has_compared:
+            return
+        size, usual = super().getNominalStepSize(), super().getUsualStepSize()
+        self._has_compared = usual > 0
+        if 0 < size < usual / 1000:
+            warnings.warn(
+                f"VariableStepRattleIntegrator: the nominal step size ({size:g} ps) is less than a thousandth of what "
+                f"is usual for the masses of this System ({usual:.2g} ps); its argument is a step in ps, and not an "
+                "error tolerance as that of VariableVerletIntegrator",
+                stacklevel=3,
+            )
 
     def _warn_of_short_steps(self) -> None:
         if self._has_warned or not self.isAutomatic() or super().getNumShortSteps() < _MANY_SHORT_STEPS:

@@ -508,3 +508,34 @@ def test_forces_written_in_python():
         integrator.step(3)
         assert context.getStepCount() == 3
         del context
+
+
+# A step that was meant as a tolerance
+
+
+@pytest.mark.parametrize(("size", "heavy"), [(0.9e-6, 1.0), (2.9e-6, 9.0)])
+def test_a_step_far_below_what_is_usual_says_so_once(size, heavy):
+    """Usual is 1 fs for a lightest particle of 1 amu, and 3 fs for one of 9; a fixed particle does not count."""
+    system, positions, velocities = rotating_dumbbell()
+    for particle in range(2):
+        system.setParticleMass(particle, heavy * (1 + particle))
+    system.addParticle(0.0)
+    integrator = VariableStepRattleIntegrator(size, monitors=[])
+    assert picoseconds(integrator.getUsualStepSize()) == 0.0  # no Context
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform("Reference"))
+    context.setPositions([*positions, [1, 1, 1]])
+    context.setVelocities([*velocities, [0, 0, 0]])
+    assert picoseconds(integrator.getUsualStepSize()) == pytest.approx(0.001 * math.sqrt(heavy), rel=1e-14)
+    with pytest.warns(UserWarning, match="less than a thousandth .* and not an error tolerance") as seen:
+        integrator.step(1)
+        integrator.stepTo(3 * size)
+    assert len(seen) == 1
+    assert seen[0].filename == __file__
+
+
+@pytest.mark.parametrize(("size", "steps"), [(1.1e-6, 1), (0.0, 0)])
+def test_a_small_step_is_no_matter(size, steps, recwarn):
+    integrator = VariableStepRattleIntegrator(size, monitors=[])
+    _ = make_context(integrator)
+    integrator.step(steps)
+    assert not recwarn

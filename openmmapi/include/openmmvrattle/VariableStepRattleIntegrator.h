@@ -122,6 +122,14 @@ public:
      * nominal one.
      */
     double getStepSize() const override;
+    /**
+     * Get the step size that is usual for the masses of the System: 1 fs for a lightest particle of 1 amu, in proportion to the root of
+     * its mass. In Python a warning says so once if the nominal step size is less than a thousandth of it, since it may have been meant
+     * as an error tolerance, which is what VariableVerletIntegrator takes.
+     *
+     * @return the step size, measured in ps; 0 while there is no Context, or if no particle has a mass
+     */
+    double getUsualStepSize() const;
     /** The same as setNominalStepSize(), so that scripts written for a fixed step keep working. */
     void setStepSize(double size) override;
     /** Get the smallest step size the monitor can ask for (in ps), or 0 if there is no bound. */
