@@ -25,7 +25,8 @@ import pytest
 from markdown_it import MarkdownIt
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
-from openmmvrattle.testsystems import alanine_dipeptide
+from openmmvrattle.compare.comparison import compare
+from openmmvrattle.testsystems import SYSTEMS, alanine_dipeptide
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -155,6 +156,36 @@ def test_every_example_is_listed() -> None:
     assert len(examples) > 5
     assert "`quick_tour.ipynb`" in page
     assert not [path.name for path in examples if f"](../{path.relative_to(ROOT).as_posix()})" not in page]
+
+
+@pytest.mark.filterwarnings("ignore:.*1000 steps in a row:UserWarning")
+@pytest.mark.parametrize(("row", "name"), [("a clash", "water-clash"), ("a whip", "light-heavy-chain")])
+def test_the_first_table_says_what_is_measured(row: str, name: str) -> None:
+    """The gains in the README, which are on the platform Reference; the row of the protein is from docs/proof.md."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    what, verlet, automatic = re.search(rf"^\| ({row}: .*) \| (.*) \| (.*) \|$", readme, re.MULTILINE).groups()
+    comparison = compare(SYSTEMS[name](), integrators=["VerletIntegrator", "Automatic"])
+    assert f"; {comparison.force_evaluations:,} " in what
+    for run, words in zip(comparison.runs, (verlet, automatic), strict=True):
+        said = float(re.search(r"[\d.]+", words)[0])
+        assert said == pytest.approx(run.largest_energy_error, rel=0.1)
+
+
+def test_the_row_of_the_protein_is_that_of_its_page() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "proof.md").read_text(encoding="utf-8")
+    what, verlet, automatic = re.search(
+        r"^\| (a protein in water: .*) \| (.*) \| (.*) \|$", readme, re.MULTILINE
+    ).groups()
+
+    def measured(name: str) -> list[str]:
+        return re.search(rf"^\| {name} \| (.*) \|$", page, re.MULTILINE)[1].split(" | ")
+
+    assert f"{re.search(r'([0-9,]+) atoms', page)[1]} atoms" in what
+    assert f"{float(measured('simulated time')[0].split()[0]):.0f} ps" in what
+    for words, number in zip((verlet, automatic), measured("fluctuation of the total energy"), strict=True):
+        assert number in words
+    assert f"{float(measured('time of a turn beside .*, median')[1]):.2f} times" in automatic
 
 
 @pytest.mark.parametrize("name", ["README", "docs/openmm", "docs/automatic", "docs/restart", "docs/migration"])
