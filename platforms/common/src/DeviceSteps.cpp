@@ -23,8 +23,9 @@ const double SINGLE_TOLERANCE = 1e-5, MIXED_TOLERANCE = 1e-12, DOUBLE_TOLERANCE 
 const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
 const double SINGLE_DENSITY_ROUNDING = 1e-4, DENSITY_ROUNDING = 1e-8;
 const double MARGIN = 0.1;
-// Of a large cluster: an iteration that takes longer is left to the host. In each launch all stages have stamps of their own.
-const int MAX_STAGES = 16, STAMPS = 32;
+// In each launch the stages of large clusters have stamps of their own.
+const int STAMPS = 32;
+static_assert(StepProgram::MAX_STAGES < STAMPS, "stages of two launches would have the same stamp");
 // A factor in single precision solves to about 1e-7, so velocities are projected twice where more is asked for.
 const double SINGLE_PROJECTION = 1e-7;
 
@@ -37,6 +38,7 @@ LargeClusters::Limits findLimits(OpenMM::ComputeContext& context) {
     // OpenMM counts six groups for each processor, and one has room in any case.
     limits.numResident = isCUDA ? context.getNumThreadBlocks() / 6 : 0;
     limits.narrow = isCUDA ? 32 : 0;
+    limits.numGroups = context.getNumThreadBlocks();
     limits.mixedSize = context.getUseMixedPrecision() || context.getUseDoublePrecision() ? 8 : 4;
     limits.realSize = context.getUseDoublePrecision() ? 8 : 4;
     limits.pieceSize = 64;
@@ -53,8 +55,8 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& cl
         context(context), kinds(clusters.small), large(clusters.large, findLimits(context)), settings(),
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
         isWide(context.getSupportsDoublePrecision()), groupSize(StepProgram::getGroupSize(!large.isEmpty())),
-        numGroups(0), numPartials(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), groupEnergy(0),
-        elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
+        numGroups(0), numPartials(0), numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0),
+        groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
@@ -90,8 +92,10 @@ void DeviceSteps::initialize() {
     multipliers.initialize(context, lengthData.size(), mixedSize, "vrattleMultipliers");
     context.clearBuffer(multipliers);
     const int needed = (program->getNumSlots() + groupSize - 1) / groupSize;
-    numGroups = std::max(1, std::min(needed, context.getNumThreadBlocks()));
-    numPartials = numGroups + (int) large.getPieces().size();
+    const int numPieces = (int) large.getPieces().size();
+    numFused = large.getForm().isFused ? numPieces : 0;
+    numGroups = std::max(1, std::min(needed, context.getNumThreadBlocks() - numFused));
+    numPartials = numGroups + numPieces;
     oldPositions.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldPositions");
     oldVelocities.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldVelocities");
     for (OpenMM::ComputeArray& array : trials)
@@ -191,14 +195,14 @@ void DeviceSteps::compile(StepProgram::Update update) {
             created.trial = text->createKernel("tryStep");
         created.advance = text->createKernel("advanceStep");
         created.restore = text->createKernel("restoreState");
-        if (!large.isEmpty()) {
+        if (!large.isEmpty() && numFused == 0) {
             created.finishLarge = text->createKernel("finishLarge");
             if (program->hasHalfSums())
                 created.tryLarge = text->createKernel("tryLarge");
             created.advanceLarge = text->createKernel("advanceLarge");
         }
         setArguments(created);
-        if (!large.isEmpty())
+        if (!large.isEmpty() && numFused == 0)
             setLargeArguments(created);
         found = compiled.insert({key, created}).first;
     }
@@ -225,6 +229,10 @@ void DeviceSteps::setArguments(Kernels& created) {
         kernel->addArg(context.getLongForceBuffer());
         kernel->addArg(multipliers);
         kernel->addArg(failure);
+        if (numFused > 0) {
+            addEmpty(kernel, 2); // stamp, numProjections
+            addLargeTables(kernel);
+        }
     };
     addEmpty(created.finish, 5); // step, kick, isFormed, isStored, control
     created.finish->addArg(settingsArray);
@@ -263,6 +271,13 @@ void DeviceSteps::setArguments(Kernels& created) {
     created.restore->addArg(oldVelocities);
 }
 
+void DeviceSteps::addLargeTables(ComputeKernel& kernel) {
+    for (OpenMM::ComputeArray* array :
+         {&largeTables, &largePieces, &largeRows, &largeRowLengths, &largeAtoms, &largeJoints, &largeJointLengths,
+          &largeMultipliers, &largeFactors, &largeWork, &largeExchange, &largePhases, &largeIterations})
+        kernel->addArg(*array);
+}
+
 // The same for kernels/large.cc.
 void DeviceSteps::setLargeArguments(Kernels& created) {
     OpenMM::ArrayInterface& corrections =
@@ -279,10 +294,7 @@ void DeviceSteps::setLargeArguments(Kernels& created) {
         kernel->addArg(context.getVelm());
         kernel->addArg(context.getLongForceBuffer());
         kernel->addArg(failure);
-        for (OpenMM::ComputeArray* array :
-             {&largeTables, &largePieces, &largeRows, &largeRowLengths, &largeAtoms, &largeJoints, &largeJointLengths,
-              &largeMultipliers, &largeFactors, &largeWork, &largeExchange, &largePhases, &largeIterations})
-            kernel->addArg(*array);
+        addLargeTables(kernel);
     };
     addEmpty(created.finishLarge,
              9); // step, firstStage, endStage, isLast, stamp, kick, isFormed, isStored, numProjections
@@ -321,18 +333,31 @@ void DeviceSteps::setWide(ComputeKernel& kernel, int index, double value) {
         kernel->setArg(index, (float) value);
 }
 
-void DeviceSteps::launch(ComputeKernel& kernel) {
-    kernel->execute(numGroups * groupSize, groupSize);
+void DeviceSteps::launch(ComputeKernel& kernel, int numOwnArguments) {
+    if (numFused > 0) {
+        kernel->setArg(numOwnArguments, nextStamp());
+        kernel->setArg(numOwnArguments + 1, getNumProjections());
+    }
+    kernel->execute((numFused + numGroups) * groupSize, groupSize);
     numLaunches++;
+}
+
+int DeviceSteps::nextStamp() {
+    numLargeLaunches++;
+    return (int) (numLargeLaunches * STAMPS & 0x7fffffffu);
+}
+
+int DeviceSteps::getNumProjections() const {
+    const bool isFactorCoarser = isMixed && !context.getUseDoublePrecision();
+    return isFactorCoarser && settings.tolerance < SINGLE_PROJECTION ? 2 : 1;
 }
 
 // All stages of the large clusters: in one launch, or one after the other.
 void DeviceSteps::launchLarge(ComputeKernel& kernel, int step, int numStages) {
     const int numPieces = (int) large.getPieces().size();
     const int numAtOnce = large.getForm().isStaged ? 1 : numStages;
-    numLargeLaunches++;
     kernel->setArg(0, step);
-    kernel->setArg(4, (int) ((unsigned) numLargeLaunches * STAMPS & 0x7fffffffu));
+    kernel->setArg(4, nextStamp());
     for (int stage = 0; stage < numStages; stage += numAtOnce) {
         kernel->setArg(1, stage);
         kernel->setArg(2, stage + numAtOnce);
@@ -349,11 +374,10 @@ void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStor
     kernels.finish->setArg(2, (int) isFormed);
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control[half]);
-    launch(kernels.finish);
-    if (large.isEmpty())
+    launch(kernels.finish, 18);
+    if (!kernels.finishLarge)
         return;
-    const bool isRefined = settings.tolerance < SINGLE_PROJECTION && !context.getUseDoublePrecision() && isMixed;
-    const int numProjections = isRefined ? 2 : 1;
+    const int numProjections = getNumProjections();
     setMixed(kernels.finishLarge, 5, kick);
     kernels.finishLarge->setArg(6, (int) isFormed);
     kernels.finishLarge->setArg(7, (int) isStored);
@@ -424,12 +448,12 @@ void DeviceSteps::advance(double maxStep) {
             kernels.trial->setArg(9, trialPartials[i % 2]);
             kernels.trial->setArg(10, trials[(i + 1) % 2]);
             kernels.trial->setArg(11, trialPartials[(i + 1) % 2]);
-            launch(kernels.trial);
-            if (!large.isEmpty()) {
+            launch(kernels.trial, 22);
+            if (kernels.tryLarge) {
                 setMixed(kernels.tryLarge, 5, settings.tolerance);
                 kernels.tryLarge->setArg(7, trials[(i + 1) % 2]);
                 kernels.tryLarge->setArg(8, trialPartials[(i + 1) % 2]);
-                launchLarge(kernels.tryLarge, stepNumber, MAX_STAGES + 1);
+                launchLarge(kernels.tryLarge, stepNumber, StepProgram::MAX_STAGES);
             }
         }
     kernels.advance->setArg(0, stepNumber);
@@ -439,12 +463,12 @@ void DeviceSteps::advance(double maxStep) {
     kernels.advance->setArg(4, numPartials);
     kernels.advance->setArg(5, control[half]);
     kernels.advance->setArg(6, control[1 - half]);
-    launch(kernels.advance);
+    launch(kernels.advance, 24);
     half = 1 - half;
-    if (!large.isEmpty()) {
+    if (kernels.advanceLarge) {
         setMixed(kernels.advanceLarge, 5, settings.tolerance);
         kernels.advanceLarge->setArg(6, control[half]);
-        launchLarge(kernels.advanceLarge, stepNumber, MAX_STAGES);
+        launchLarge(kernels.advanceLarge, stepNumber, StepProgram::MAX_STAGES);
     }
 }
 

@@ -106,7 +106,10 @@ private:
     void setLargeArguments(Kernels& created);
     void setMixed(OpenMM::ComputeKernel& kernel, int index, double value);
     void setWide(OpenMM::ComputeKernel& kernel, int index, double value);
-    void launch(OpenMM::ComputeKernel& kernel);
+    void addLargeTables(OpenMM::ComputeKernel& kernel);
+    void launch(OpenMM::ComputeKernel& kernel, int numOwnArguments);
+    int nextStamp();
+    int getNumProjections() const;
     void launchLarge(OpenMM::ComputeKernel& kernel, int step, int numStages);
     void launchFinish(int step, double kick, bool isFormed, bool isStored);
     void launchEvaluate(int step, bool isRescaled);
@@ -123,7 +126,8 @@ private:
     int groupSize;
     int numGroups;   // of work, each of which leaves its sums
     int numPartials; // with the pieces of large clusters, which leave theirs behind
-    int numLargeLaunches;
+    int numFused;    // pieces among the work groups of the small clusters
+    unsigned numLargeLaunches;
     long long numLaunches;
     int half;       // the control block that is in force
     int stepNumber; // of the last advance()

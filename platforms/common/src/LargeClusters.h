@@ -26,6 +26,7 @@ public:
         int numResident; // work groups that are sure to run at the same time, and may wait for each other; 0 if none may
         int narrow; // threads that are in step without a barrier; 0 if it is not known
         int mixedSize, realSize;
+        int numGroups; // that a launch can have
         int pieceSize; // constraints; more if the pieces were too many to be resident
     };
     /** How the pieces are worked on. */
@@ -34,6 +35,7 @@ public:
         bool isInLocalMemory;
         bool hasJoints;
         bool isStaged; // each stage is a launch of its own, since groups cannot wait for each other
+        bool isFused; // the pieces are work groups of the launches of the small clusters
     };
     /** Sixteen numbers for each piece, as kernels/large.cc has them. */
     struct Piece {

@@ -322,10 +322,14 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
 }
 
 void StepProgram::writeLargeClusters(const LargeClusters& large) {
-    words["LARGE_CLUSTERS"] = large.isEmpty() ? "" : DeviceSources::large;
+    const LargeClusters::Form& form = large.getForm();
+    words["LARGE_CLUSTERS"] =
+        large.isEmpty() ? "#define FUSED_PARAMETERS\n#define FUSED_MEMORY\n" : DeviceSources::large;
+    defines["IS_FUSED"] = form.isFused ? "1" : "0";
+    defines["NUM_FUSED"] = to_string(form.isFused ? large.getPieces().size() : 0);
+    defines["MAX_STAGES"] = to_string(MAX_STAGES);
     if (large.isEmpty())
         return;
-    const LargeClusters::Form& form = large.getForm();
     const bool hasNarrow = large.getNarrow() > 0;
     defines["NUM_THREADS"] = to_string(large.getNumThreads());
     defines["USE_RECORDS"] = form.areRecords ? "1" : "0";

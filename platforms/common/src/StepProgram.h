@@ -61,6 +61,8 @@ public:
         int firstSlot, firstAtom, firstLength;
     };
     static const int SLOT_UNIT = 32;
+    /** Of a large cluster: an iteration that takes longer is left to the host. */
+    static const int MAX_STAGES = 16;
 
     /**
      * @param kinds         the clusters that one thread can have

@@ -52,7 +52,7 @@ int main(int argc, char** argv) {
     const ClusterKinds kinds(system);
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
     const LargeClusters large(kinds.large,
-                              {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 64});
+                              {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
     const StepProgram program(kinds.small, large, terms, StepProgram::updateOf(terms, false, update),
                               precision != "single", true);
     for (const auto& define : program.getDefines())

@@ -353,7 +353,7 @@ void testDiamond() {
 // How the work is divided, which no result shows.
 void testDivision() {
     const Molecules molecules = makeMolecules({makeProtein(60), makeChain(130), makeChain(1500)});
-    LargeClusters::Limits limits = {128, 40 * 1024, 132, 32, 8, 4, 64};
+    LargeClusters::Limits limits = {128, 40 * 1024, 132, 32, 8, 4, 792, 64};
     const ClusterKinds kinds(molecules.system);
     const LargeClusters waiting(kinds.large, limits);
     ASSERT(waiting.getForm().areRecords && waiting.getForm().isInLocalMemory && waiting.getForm().hasJoints);

@@ -18,12 +18,12 @@
 #define THREAD 0
 #define SYNC_PIECE
 #define MERGE_SUMS(sums)
-#define LARGE_MEMORY LOCAL uint4 shared[SHARED_SIZE]; LOCAL int flags[2];
+#define LARGE_MEMORY LOCAL mixed buffer[1]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
 #else
 #define THREAD LOCAL_ID
 #define SYNC_PIECE SYNC_THREADS
 #define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
-#define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 shared[SHARED_SIZE]; LOCAL int flags[2];
+#define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
 #endif
 
 #define FINISH 0
@@ -298,7 +298,7 @@ typedef struct {
  * not converged in all stages there are.
  */
 inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARAMETERS, LARGE_STATE_PARAMETERS,
-        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, mixed* sums, mixed* halfSums, LOCAL_ARG uint4* shared, LOCAL_ARG int* flags) {
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, mixed* sums, mixed* halfSums, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     const int4 first = pieces[4*piece], second = pieces[4*piece+1], third = pieces[4*piece+2], fourth = pieces[4*piece+3];
     const int firstRow = first.z, numInner = first.w, numBorders = second.x, firstAtom = second.y, numAtoms = second.z, firstJoint = second.w, numJoints = third.x;
     const int numRows = numInner + numBorders, numKept = third.z;
@@ -307,10 +307,10 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     GLOBAL volatile mm_ulong* channel = exchange + fourth.x;
 #if IN_LOCAL_MEMORY
     for (int i = THREAD; i < first.y; i += NUM_THREADS)
-        shared[i] = allTables[first.x+i];
-    MEMORY const uint4* tables = shared;
-    MEMORY mixed* M = (MEMORY mixed*) (shared + fourth.y);
-    MEMORY real* A = (MEMORY real*) (shared + fourth.z);
+        memory[i] = allTables[first.x+i];
+    MEMORY const uint4* tables = memory;
+    MEMORY mixed* M = (MEMORY mixed*) (memory + fourth.y);
+    MEMORY real* A = (MEMORY real*) (memory + fourth.z);
     if (mode != FINISH)
         for (int i = THREAD; i < numKept; i += NUM_THREADS)
             A[i] = kept[i];
@@ -676,36 +676,21 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     return completed | (mode != FINISH && phase != COMPLETE ? 4 : 0);
 }
 
-/** finishStep for the pieces. */
-KERNEL void finishLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed kick, int isFormed, int isStored, int numProjections,
-        GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL mixed* RESTRICT partials, int numPartials, int numPieces,
-        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
-    LARGE_MEMORY
+/** The second half of a step for every stride-th piece; see finishStep. */
+inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask task, GLOBAL mixed* RESTRICT partials, int numPartials, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS,
+        LOCAL_ARG mixed* buffer, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
-    const bool isFrozen = (failure[0] != 0);
-    LargeTask task;
-    task.step = step;
-    task.firstStage = firstStage;
-    task.endStage = endStage;
-    task.numProjections = numProjections;
-    task.stamp = (word_t) stamp;
-    task.dt = kick*(mixed) control[STEP_SIZE];
-    task.halfKick = (mixed) (settings[NOMINAL]/(2*control[DENSITY]));
-    task.formHalf = (isFormed || control[IS_SHORTENED] != 0);
-    task.isWritten = (isStored && !isFrozen);
-    task.canFail = !isFrozen;
-    task.tolerance = 0;
-    for (int piece = GROUP_ID; piece < numPieces; piece += NUM_GROUPS) {
+    for (; piece < numPieces; piece += stride) {
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = halfSums[j] = 0;
-        const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, shared, flags);
+        const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
         MERGE_SUMS(sums);
-        if (THREAD == 0 && !isFrozen && (completed & 1) != 0)
+        if (THREAD == 0 && task.canFail && (completed & 1) != 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 partials[j*numPartials + numPartials - numPieces + piece] = sums[j];
 #if HALF_SUMS
         MERGE_SUMS(halfSums);
-        if (THREAD == 0 && !isFrozen && (completed & 2) != 0)
+        if (THREAD == 0 && task.canFail && (completed & 2) != 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 partials[(NUM_SUMS + j)*numPartials + numPartials - numPieces + piece] = halfSums[j];
 #endif
@@ -714,26 +699,14 @@ KERNEL void finishLarge(int step, int firstStage, int endStage, int isLast, int 
 
 #if HALF_SUMS
 
-/** tryStep for the pieces, which takes what that has found of the next trial. */
-KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT settings, GLOBAL const wide* RESTRICT nextTrial,
-        GLOBAL mixed* RESTRICT nextPartials, int numPartials, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
-    LARGE_MEMORY
+/** A trial of a step; see tryStep. */
+inline DEVICE void tryPieces(int piece, int numPieces, int stride, LargeTask task, int isLast, GLOBAL mixed* RESTRICT nextPartials, int numPartials,
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG mixed* buffer, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
-    LargeTask task;
-    task.step = step;
-    task.firstStage = firstStage;
-    task.endStage = endStage;
-    task.numProjections = 0;
-    task.stamp = (word_t) stamp;
-    task.dt = (mixed) (settings[NOMINAL]/nextTrial[TRIAL_DENSITY]);
-    task.halfKick = 0;
-    task.formHalf = task.isWritten = task.canFail = 0;
-    task.tolerance = tolerance;
-    const int end = (nextTrial[TRIAL_STATUS] == TRYING && !IS_FROZEN(failure, step) ? numPieces : 0);
-    for (int piece = GROUP_ID; piece < end; piece += NUM_GROUPS) {
+    for (; piece < numPieces; piece += stride) {
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = halfSums[j] = 0;
-        const int completed = runPiece(TRY, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, shared, flags);
+        const int completed = runPiece(TRY, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
         const bool hasFailed = (isLast && (completed & 4) != 0);
         if (THREAD == 0 && hasFailed)
             sums[FAILURES] += 1;
@@ -746,27 +719,84 @@ KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int sta
 
 #endif
 
-/** advanceStep for the pieces, which takes the step size that that has found. */
-KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions,
-        GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
-    LARGE_MEMORY
+/** The first half of a step; see advanceStep. */
+inline DEVICE void advancePieces(int piece, int numPieces, int stride, LargeTask task, int isLast, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities,
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
+    for (; piece < numPieces; piece += stride) {
+        const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, memory, flags);
+        if (THREAD == 0 && isLast && (completed & 4) != 0)
+            fail(failure, task.step, NOT_CONVERGED + NUM_CODES*piece);
+    }
+}
+
+inline DEVICE LargeTask makeTask(int step, int firstStage, int endStage, int stamp, mixed dt, mixed tolerance) {
     LargeTask task;
     task.step = step;
     task.firstStage = firstStage;
     task.endStage = endStage;
     task.numProjections = 0;
     task.stamp = (word_t) stamp;
-    task.dt = (mixed) nextControl[STEP_SIZE];
+    task.dt = dt;
     task.halfKick = 0;
     task.formHalf = 0;
     task.isWritten = task.canFail = 1;
     task.tolerance = tolerance;
+    return task;
+}
+
+inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage, int stamp, int numProjections, mixed dt, mixed halfKick, bool formHalf, bool isStored, bool isFrozen) {
+    LargeTask task = makeTask(step, firstStage, endStage, stamp, dt, 0);
+    task.numProjections = numProjections;
+    task.halfKick = halfKick;
+    task.formHalf = formHalf;
+    task.isWritten = (isStored && !isFrozen);
+    task.canFail = !isFrozen;
+    return task;
+}
+
+#if IS_FUSED
+
+// The pieces are the first work groups of the launches of the small clusters, which hide behind each other.
+#define FUSED_PARAMETERS , int stamp, int numProjections, LARGE_PARAMETERS
+#define FUSED_MEMORY LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
+
+#else
+
+#define FUSED_PARAMETERS
+#define FUSED_MEMORY
+
+/** finishStep for the pieces. */
+KERNEL void finishLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed kick, int isFormed, int isStored, int numProjections,
+        GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL mixed* RESTRICT partials, int numPartials, int numPieces,
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
+    const LargeTask task = makeFinishingTask(step, firstStage, endStage, stamp, numProjections, kick*(mixed) control[STEP_SIZE],
+            (mixed) (settings[NOMINAL]/(2*control[DENSITY])), isFormed || control[IS_SHORTENED] != 0, isStored != 0, failure[0] != 0);
+    finishPieces(GROUP_ID, numPieces, NUM_GROUPS, task, partials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
+}
+
+#if HALF_SUMS
+
+/** tryStep for the pieces, which takes what that has found of the next trial. */
+KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT settings, GLOBAL const wide* RESTRICT nextTrial,
+        GLOBAL mixed* RESTRICT nextPartials, int numPartials, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
+    const bool isTrying = (nextTrial[TRIAL_STATUS] == TRYING && !IS_FROZEN(failure, step));
+    const LargeTask task = makeTask(step, firstStage, endStage, stamp, (mixed) (settings[NOMINAL]/nextTrial[TRIAL_DENSITY]), tolerance);
+    tryPieces(isTrying ? GROUP_ID : numPieces, numPieces, NUM_GROUPS, task, isLast, nextPartials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
+}
+
+#endif
+
+/** advanceStep for the pieces, which takes the step size that that has found. */
+KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions,
+        GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+    LARGE_MEMORY
     // Only what earlier launches have written may decide, or the groups of one cluster would not agree: this one writes other codes.
     const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
-    for (int piece = GROUP_ID; piece < (isFrozen ? 0 : numPieces); piece += NUM_GROUPS) {
-        const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, shared, flags);
-        if (THREAD == 0 && isLast && (completed & 4) != 0)
-            fail(failure, step, NOT_CONVERGED + NUM_CODES*piece);
-    }
+    const LargeTask task = makeTask(step, firstStage, endStage, stamp, (mixed) nextControl[STEP_SIZE], tolerance);
+    advancePieces(isFrozen ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags);
 }
+
+#endif

@@ -194,6 +194,13 @@ inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
 
 CLUSTER_FUNCTIONS
 
+LARGE_CLUSTERS
+
+// The work groups that have clusters in single threads, which come behind those that have a piece of a large one.
+#define SMALL_GROUP ((int) GROUP_ID - NUM_FUSED)
+#define SMALL_SLOT (SMALL_GROUP*GROUP_SIZE + (int) LOCAL_ID)
+#define NUM_SMALL_SLOTS (((int) NUM_GROUPS - NUM_FUSED)*GROUP_SIZE)
+
 // ------------------------------------------------------------------------------------------------------------------- the kernels
 
 /**
@@ -204,8 +211,9 @@ CLUSTER_FUNCTIONS
  * on-step ones. Without isStored the velocities are left as they are.
  */
 KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
-        GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS) {
+        GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS FUSED_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    FUSED_MEMORY
     const mixed dt = (mixed) control[STEP_SIZE];
     // After a shortened step the half-step velocities are formed anew, as those of a step of the density that goes on.
     const bool formHalf = (isFormed || control[IS_SHORTENED] != 0);
@@ -222,8 +230,15 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
 #endif
     // After a failure the sums stay those of the state that is put back.
     const bool isFrozen = (failure[0] != 0);
+#if IS_FUSED
+    if (GROUP_ID < NUM_FUSED) {
+        const LargeTask task = makeFinishingTask(step, 0, MAX_STAGES, stamp, numProjections, kick*dt, halfKick, formHalf, isStored != 0, isFrozen);
+        finishPieces(GROUP_ID, NUM_FUSED, NUM_FUSED, task, partials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
+        return;
+    }
+#endif
     const int end = (isFrozen ? 0 : numSlots);
-    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+    for (int slot = SMALL_SLOT; slot < end; slot += NUM_SMALL_SLOTS) {
         bool isRegular = true;
         FINISH_CASES
         if (!isRegular)
@@ -232,13 +247,13 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
     mergeInGroup(sums, buffer);
     if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
-            partials[j*numPartials + GROUP_ID] = sums[j];
+            partials[j*numPartials + SMALL_GROUP] = sums[j];
 #if HALF_SUMS
     SYNC_THREADS;
     mergeInGroup(halfSums, buffer);
     if (LOCAL_ID == 0 && !isFrozen)
         for (int j = 0; j < NUM_SUMS; j++)
-            partials[(NUM_SUMS + j)*numPartials + GROUP_ID] = halfSums[j];
+            partials[(NUM_SUMS + j)*numPartials + SMALL_GROUP] = halfSums[j];
 #endif
 }
 
@@ -310,8 +325,9 @@ inline DEVICE bool judgeTrial(wide uTrial, wide* trial, GLOBAL const wide* RESTR
  */
 KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int numPartials, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
         GLOBAL const mixed* RESTRICT partials, GLOBAL const wide* RESTRICT lastTrial, GLOBAL const mixed* RESTRICT lastPartials,
-        GLOBAL wide* RESTRICT nextTrial, GLOBAL mixed* RESTRICT nextPartials, STATE_PARAMETERS) {
+        GLOBAL wide* RESTRICT nextTrial, GLOBAL mixed* RESTRICT nextPartials, STATE_PARAMETERS FUSED_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    FUSED_MEMORY
     LOCAL wide shared[2];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     const bool isFrozen = IS_FROZEN(failure, step);
@@ -340,10 +356,17 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
     }
     SYNC_THREADS;
     const mixed dt = (mixed) shared[0];
+#if IS_FUSED
+    if (GROUP_ID < NUM_FUSED) {
+        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, dt, tolerance);
+        tryPieces(dt > 0 ? GROUP_ID : NUM_FUSED, NUM_FUSED, NUM_FUSED, task, 1, nextPartials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
+        return;
+    }
+#endif
     for (int j = 0; j < NUM_SUMS; j++)
         sums[j] = 0;
     const int end = (dt > 0 ? numSlots : 0);
-    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+    for (int slot = SMALL_SLOT; slot < end; slot += NUM_SMALL_SLOTS) {
         bool isSolved = true;
         TRIAL_CASES
         if (!isSolved)
@@ -352,7 +375,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
     mergeInGroup(sums, buffer);
     if (LOCAL_ID == 0)
         for (int j = 0; j < NUM_SUMS; j++)
-            nextPartials[j*numPartials + GROUP_ID] = sums[j];
+            nextPartials[j*numPartials + SMALL_GROUP] = sums[j];
 }
 
 #endif
@@ -363,8 +386,9 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
  */
 KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed tolerance, int numPartials, GLOBAL const wide* RESTRICT control, GLOBAL wide* RESTRICT nextControl,
         GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials, GLOBAL const wide* RESTRICT lastTrial, GLOBAL const mixed* RESTRICT lastPartials,
-        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS) {
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS FUSED_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    FUSED_MEMORY
     LOCAL wide shared[2];
     mixed sums[NUM_SUMS];
     const bool isFrozen = IS_FROZEN(failure, step);
@@ -414,13 +438,20 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
     }
     SYNC_THREADS;
     const mixed dt = (mixed) shared[0];
+#if IS_FUSED
+    if (GROUP_ID < NUM_FUSED) {
+        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, dt, tolerance);
+        advancePieces(dt >= 0 ? GROUP_ID : NUM_FUSED, NUM_FUSED, NUM_FUSED, task, 1, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags);
+        return;
+    }
+#endif
     const int end = (dt >= 0 ? numSlots : 0);
-    for (int slot = GLOBAL_ID; slot < end; slot += GLOBAL_SIZE) {
+    for (int slot = SMALL_SLOT; slot < end; slot += NUM_SMALL_SLOTS) {
         int iterations = 0;
         ADVANCE_CASES
         if (iterations < 0)
             fail(failure, step, NOT_CONVERGED + NUM_CODES*slot);
-        iterationCounts[GLOBAL_ID] += iterations;
+        iterationCounts[SMALL_SLOT] += iterations;
     }
 }
 
@@ -434,5 +465,3 @@ KERNEL void restoreState(int numAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4
             velm[i] = oldVelocities[i];
         }
 }
-
-LARGE_CLUSTERS
