@@ -49,7 +49,7 @@ nitpick_ignore_regex = [
     ("py:.*", r"(Any|Path|Callable|Sequence|Iterator|Figure|Context|Quantity|OpenMMException)"),
     ("py:.*", r"(Custom|Compound|Verlet|VariableVerlet)?Integrator"),
     ("py:.*", r"(bool|dict|float|int|list|None|object|str|tuple|type|TypeError|ValueError|optional)"),
-    ("cpp:.*", r"(OpenMM|std)(::.*)?|string|vector|size_t|osrngseed"),
+    ("cpp:.*", r"(OpenMM|std)(::.*)?|OpenMMVRattle|string|vector|size_t|osrngseed"),
 ]
 
 autodoc_member_order = "bysource"
