@@ -40,6 +40,7 @@ myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"  # the notebook is kept without output
 nb_execution_raise_on_error = True
+os.environ.setdefault("OPENMM_DEFAULT_PLATFORM", "CPU")  # and not OpenCL on a processor, where there is that
 
 # Warnings are errors, and names that lead nowhere are warnings. Exempt is what others document elsewhere: Python,
 # NumPy, matplotlib, OpenMM and the C++ standard library.
