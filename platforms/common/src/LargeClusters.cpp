@@ -293,7 +293,8 @@ LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& lim
     form.isStaged =
         form.hasJoints && std::count_if(pieces.begin(), pieces.end(), isJoined) > std::max(limits.numResident, 0);
     form.isInLocalMemory = form.areRecords && !form.isStaged && 16 * localSize <= limits.localMemory;
-    form.isFused = form.isInLocalMemory && limits.numResident > 0 && 2 * (int) pieces.size() <= limits.numGroups;
+    form.isFused = !pieces.empty() && form.isInLocalMemory && limits.numResident > 0 &&
+                   2 * (int) pieces.size() <= limits.numGroups;
     if (form.isInLocalMemory) {
         numFactors = numWork = 0;
         for (Piece& piece : pieces) {
