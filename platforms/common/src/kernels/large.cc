@@ -26,6 +26,9 @@
 #define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
 #endif
 
+// Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
+#define KEEP_LOOP _Pragma("unroll 1")
+
 #define FINISH 0
 #define ADVANCE 1
 #define TRY 2
@@ -75,7 +78,7 @@ inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_
         if (count == 2)
             value -= second;
         int at = (int) record.w;
-        for (int i = 1; i < (count > 2 ? count : 0); i++, at += 3)
+        KEEP_LOOP for (int i = 1; i < (count > 2 ? count : 0); i++, at += 3)
             value -= A[more[at]]*A[more[at+1]]/A[more[at+2]];
         A[target] = value;
     }
@@ -89,7 +92,7 @@ inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_
         if (count == 3)
             value -= third;
         int at = (int) record.w;
-        for (int i = 2; i < (count > 3 ? count : 0); i++, at += 2)
+        KEEP_LOOP for (int i = 2; i < (count > 3 ? count : 0); i++, at += 2)
             value -= A[more[at]]*x[more[at+1]];
         x[target] = value;
     }
@@ -110,7 +113,7 @@ inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_
         if (count == 5)
             value -= fifth;
         const int at = (int) record.w;
-        for (int i = 3; i < (count > 5 ? count : 0); i++)
+        KEEP_LOOP for (int i = 3; i < (count > 5 ? count : 0); i++)
             value -= A[a+i]*x[more[at+i-3]];
         x[target] = value;
     }
@@ -120,10 +123,10 @@ inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_
 #define RUN_LEVELS(FIRST, END, LANES, SYNCHRONIZE) { \
         int begin = (FIRST < END ? starts[FIRST] : 0), end = (FIRST < END ? starts[FIRST+1] : 0); \
         uint4 record = records[begin + THREAD]; \
-        for (int level = FIRST; level < END; level++) { \
+        KEEP_LOOP for (int level = FIRST; level < END; level++) { \
             const int next = starts[level+2]; \
             const uint4 nextRecord = records[end + THREAD]; \
-            for (int i = begin + THREAD; i < (THREAD < LANES ? end : 0); i += LANES) \
+            KEEP_LOOP for (int i = begin + THREAD; i < (THREAD < LANES ? end : 0); i += LANES) \
                 applyRecord(pass, i < begin + LANES ? record : records[i], more, A, x); \
             record = nextRecord; \
             begin = end; \
@@ -151,9 +154,9 @@ inline DEVICE void runLevels(const int pass, int numLevels, int numWide, MEMORY 
 /** The same for several right-hand sides. */
 inline DEVICE void runForAll(const int pass, int numLevels, MEMORY const int* starts, MEMORY const uint4* records, MEMORY const index_t* more,
         MEMORY real* A, MEMORY real* X, int count, int stride) {
-    for (int level = 0; level < numLevels; level++) {
+    KEEP_LOOP for (int level = 0; level < numLevels; level++) {
         const int begin = starts[level], number = (starts[level+1] - begin)*count;
-        for (int i = THREAD; i < number; i += NUM_THREADS)
+        KEEP_LOOP for (int i = THREAD; i < number; i += NUM_THREADS)
             applyRecord(pass, records[begin + i/count], more, A, X + (i%count)*stride);
         SYNC_PIECE;
     }
@@ -163,12 +166,12 @@ inline DEVICE void runForAll(const int pass, int numLevels, MEMORY const int* st
 inline DEVICE bool scaleFactor(int numLevels, MEMORY const int* starts, MEMORY const uint4* records, MEMORY real* A, MEMORY const real* diagonal) {
     bool isRegular = true;
     const int begin = (numLevels > 0 ? starts[0] : 0), end = (numLevels > 0 ? starts[numLevels] : 0);
-    for (int i = begin + THREAD; i < end; i += NUM_THREADS) {
+    KEEP_LOOP for (int i = begin + THREAD; i < end; i += NUM_THREADS) {
         const uint4 record = records[i];
         const int k = LOW(record.x), count = HIGH(record.x), a = LOW(record.y);
         const real pivot = A[k], inverse = 1/pivot;
         isRegular = isRegular && pivot > (real) MIN_LARGE_PIVOT*diagonal[k];
-        for (int j = a; j < a + count; j++)
+        KEEP_LOOP for (int j = a; j < a + count; j++)
             A[j] *= inverse;
         A[k] = inverse;
     }
@@ -184,7 +187,7 @@ inline DEVICE real multiplyRows(MEMORY const int* rowStart, MEMORY const int* ro
     real sum = 0;
     int p = rowStart[i], q = rowStart[j];
     const int endP = rowStart[i+1], endQ = rowStart[j+1];
-    for (int n = endP - p + endQ - q; n > 0; n--) {
+    KEEP_LOOP for (int n = endP - p + endQ - q; n > 0; n--) {
         const bool areLeft = (p < endP && q < endQ);
         const int k = (areLeft ? rowColumn[p] : 0), l = (areLeft ? rowColumn[q] : 1);
         if (areLeft && k == l)
@@ -197,26 +200,26 @@ inline DEVICE real multiplyRows(MEMORY const int* rowStart, MEMORY const int* ro
 
 inline DEVICE void runRows(const int pass, int numRows, int numLevels, MEMORY const int* starts, MEMORY const int* columnStart, MEMORY const int* entryRow,
         MEMORY const int* entryColumn, MEMORY const int* rowStart, MEMORY const int* rowEntry, MEMORY const int* rowColumn, MEMORY real* A, MEMORY real* x) {
-    for (int number = 0; number < numLevels; number++) {
+    KEEP_LOOP for (int number = 0; number < numLevels; number++) {
         const int level = (pass == BACKWARD ? numLevels - 1 - number : number), begin = starts[level], end = starts[level+1];
-        for (int j = begin + THREAD; j < end; j += NUM_THREADS) {
+        KEEP_LOOP for (int j = begin + THREAD; j < end; j += NUM_THREADS) {
             if (pass == FACTORIZE)
                 A[j] -= multiplyRows(rowStart, rowEntry, rowColumn, A, j, j);
             else if (pass == FORWARD) {
                 real value = x[j];
-                for (int p = rowStart[j]; p < rowStart[j+1]; p++)
+                KEEP_LOOP for (int p = rowStart[j]; p < rowStart[j+1]; p++)
                     value -= A[rowEntry[p]]*x[rowColumn[p]];
                 x[j] = value;
             }
             else {
                 real value = x[j]*A[j];
-                for (int p = columnStart[j]; p < columnStart[j+1]; p++)
+                KEEP_LOOP for (int p = columnStart[j]; p < columnStart[j+1]; p++)
                     value -= A[numRows+p]*x[entryRow[p]];
                 x[j] = value;
             }
         }
         const int firstEntry = (pass == FACTORIZE ? columnStart[begin] : 0), endEntry = (pass == FACTORIZE ? columnStart[end] : 0);
-        for (int p = firstEntry + THREAD; p < endEntry; p += NUM_THREADS)
+        KEEP_LOOP for (int p = firstEntry + THREAD; p < endEntry; p += NUM_THREADS)
             A[numRows+p] -= multiplyRows(rowStart, rowEntry, rowColumn, A, entryRow[p], entryColumn[p]);
         SYNC_PIECE;
     }
@@ -225,10 +228,10 @@ inline DEVICE void runRows(const int pass, int numRows, int numLevels, MEMORY co
 /** From entries L D and D to L and 1/D. Returns false if a pivot is too small a fraction of the diagonal of K. */
 inline DEVICE bool scaleFactor(int numRows, MEMORY const int* columnStart, MEMORY real* entries, MEMORY real* A, MEMORY const real* diagonal) {
     bool isRegular = true;
-    for (int k = THREAD; k < numRows; k += NUM_THREADS) {
+    KEEP_LOOP for (int k = THREAD; k < numRows; k += NUM_THREADS) {
         const real pivot = A[k], inverse = 1/pivot;
         isRegular = isRegular && pivot > (real) MIN_LARGE_PIVOT*diagonal[k];
-        for (int p = columnStart[k]; p < columnStart[k+1]; p++)
+        KEEP_LOOP for (int p = columnStart[k]; p < columnStart[k+1]; p++)
             entries[p] *= inverse;
         A[k] = inverse;
     }
@@ -244,7 +247,7 @@ inline DEVICE bool scaleFactor(int numRows, MEMORY const int* columnStart, MEMOR
 inline DEVICE void sendValue(GLOBAL volatile mm_ulong* words, int stride, mixed value, word_t stamp) {
     SentValue sent;
     sent.value = value;
-    for (int i = 0; i < WORDS_PER_VALUE; i++)
+    UNROLL for (int i = 0; i < WORDS_PER_VALUE; i++)
         words[i*stride] = (mm_ulong) stamp << 32 | sent.words[i];
 }
 
@@ -252,7 +255,7 @@ inline DEVICE void sendValue(GLOBAL volatile mm_ulong* words, int stride, mixed 
 inline DEVICE bool receiveValues(const int count, GLOBAL volatile const mm_ulong* words, int stride, word_t stamp, mixed* values) {
     mm_ulong word[8*WORDS_PER_VALUE];
     bool isComplete = false;
-    for (int poll = 0; poll < MAX_POLLS && !isComplete; poll++) {
+    KEEP_LOOP for (int poll = 0; poll < MAX_POLLS && !isComplete; poll++) {
         isComplete = true;
         UNROLL for (int i = 0; i < count*WORDS_PER_VALUE; i++)
             word[i] = words[i*stride];
@@ -306,13 +309,13 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     GLOBAL real* kept = factors + third.y;
     GLOBAL volatile mm_ulong* channel = exchange + fourth.x;
 #if IN_LOCAL_MEMORY
-    for (int i = THREAD; i < first.y; i += NUM_THREADS)
+    KEEP_LOOP for (int i = THREAD; i < first.y; i += NUM_THREADS)
         memory[i] = allTables[first.x+i];
     MEMORY const uint4* tables = memory;
     MEMORY mixed* M = (MEMORY mixed*) (memory + fourth.y);
     MEMORY real* A = (MEMORY real*) (memory + fourth.z);
     if (mode != FINISH)
-        for (int i = THREAD; i < numKept; i += NUM_THREADS)
+        KEEP_LOOP for (int i = THREAD; i < numKept; i += NUM_THREADS)
             A[i] = kept[i];
 #else
     MEMORY const uint4* tables = allTables + first.x;
@@ -346,7 +349,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
 
     // ---------------------------------------------------------------------------------------- the state at the beginning
     bool isRegular = true; // no constraints that depend on each other, no force that is no number
-    for (int k = THREAD; k < (isBeginning ? numRows : 0); k += NUM_THREADS) {
+    KEEP_LOOP for (int k = THREAD; k < (isBeginning ? numRows : 0); k += NUM_THREADS) {
         const int4 row = rows[firstRow+k];
         const mixed length = rowLengths[firstRow+k];
         mixed x1[3], x2[3], v[3], a1[3], a2[3], r[3], pull = 0;
@@ -379,7 +382,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             pulls[k] = pull;
         }
     }
-    for (int j = THREAD; j < (isBeginning ? numJoints : 0); j += NUM_THREADS) {
+    KEEP_LOOP for (int j = THREAD; j < (isBeginning ? numJoints : 0); j += NUM_THREADS) {
         const int4 joint = joints[firstJoint+j];
         const mixed length = jointLengths[firstJoint+j];
         mixed x1[3], x2[3], v[3], a1[3], a2[3], r[3];
@@ -397,7 +400,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             jointWeights[j] = (real) ((w1 + w2)*square);
         }
     }
-    for (int i = THREAD; i < (isBeginning ? numAtoms : 0); i += NUM_THREADS) {
+    KEEP_LOOP for (int i = THREAD; i < (isBeginning ? numAtoms : 0); i += NUM_THREADS) {
         const int atom = pieceAtoms[firstAtom+i];
         mixed v[3], a[3];
         W[i] = loadVelocity(velm, atom, v);
@@ -417,7 +420,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         }
     }
     if (mode == FINISH)
-        for (int i = numRows + THREAD; i < (isBeginning ? numKept : 0); i += NUM_THREADS)
+        KEEP_LOOP for (int i = numRows + THREAD; i < (isBeginning ? numKept : 0); i += NUM_THREADS)
             A[i] = 0;
     SYNC_PIECE;
     MEMORY const int* header = (MEMORY const int*) tables;
@@ -459,7 +462,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
 #endif
 
     // K; its diagonal is there
-    for (int i = THREAD; i < (mode == FINISH && isBeginning ? numCouplings : 0); i += NUM_THREADS) {
+    KEEP_LOOP for (int i = THREAD; i < (mode == FINISH && isBeginning ? numCouplings : 0); i += NUM_THREADS) {
         MEMORY const int* coupling = couplings + 5*i;
         const int k = coupling[1], l = coupling[2];
         real weight = 0;
@@ -481,13 +484,13 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
 #endif
 #if HAS_JOINTS
     if (mode == FINISH)
-        for (int i = THREAD; i < (isBeginning ? numBorders + numBorderEntries : 0); i += NUM_THREADS)
+        KEEP_LOOP for (int i = THREAD; i < (isBeginning ? numBorders + numBorderEntries : 0); i += NUM_THREADS)
             sendValue(channel + WORDS_PER_VALUE*(16*numJoints + firstContribution + i), 1, A[i < numBorders ? numInner + i : firstBorderEntry + i - numBorders], task.stamp);
 #endif
 
     // --------------------------------------------------------------------------------------------------------- the stages
     int completed = 0;
-    for (int stage = task.firstStage; stage < task.endStage && phase != COMPLETE; stage++) {
+    KEEP_LOOP for (int stage = task.firstStage; stage < task.endStage && phase != COMPLETE; stage++) {
         const int now = stage & 1;
         const bool isUnderWay = (stage > 0);
         if (THREAD == 0)
@@ -496,7 +499,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         // What the others have sent.
         const word_t lastStamp = task.stamp + (word_t) stage - 1;
         GLOBAL volatile const mm_ulong* inbox = channel + (now ^ 1)*8*WORDS_PER_VALUE*numJoints;
-        for (int j = THREAD; j < (isUnderWay ? numJoints : 0); j += NUM_THREADS) {
+        KEEP_LOOP for (int j = THREAD; j < (isUnderWay ? numJoints : 0); j += NUM_THREADS) {
             mixed sent[8], r[3], s[3];
             bool isConverged = receiveValues(8, inbox + j, numJoints, lastStamp, sent);
             UNROLL for (int d = 0; d < 3; d++) {
@@ -513,16 +516,16 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         // The joints' matrix, at first.
         const int isFresh = (mode == FINISH && stage == 1 && numJoints > 0 ? 1 : 0);
         GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
-        for (int i = THREAD; i < isFresh*(numJoints + numJointEntries); i += NUM_THREADS) {
+        KEEP_LOOP for (int i = THREAD; i < isFresh*(numJoints + numJointEntries); i += NUM_THREADS) {
             mixed sum = 0;
-            for (int at = sourceStart[i]; at < sourceStart[i+1]; at++) {
+            KEEP_LOOP for (int at = sourceStart[i]; at < sourceStart[i+1]; at++) {
                 mixed value;
                 receiveValues(1, contributions + WORDS_PER_VALUE*sources[at], 1, task.stamp, &value);
                 sum += value;
             }
             J[i] = (real) sum;
         }
-        for (int i = THREAD; i < isFresh*numBorders*numJoints; i += NUM_THREADS)
+        KEEP_LOOP for (int i = THREAD; i < isFresh*numBorders*numJoints; i += NUM_THREADS)
             Z[i] = ((borders[i/numJoints] >> 1) == i%numJoints ? 1 : 0);
         SYNC_PIECE;
         runLevels(FACTORIZE, isFresh*numJointLevels, numJointLevels, jointStarts, tables, jointMore, J, J);
@@ -536,9 +539,9 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         const bool isConverged = (phase == POSITIONS && stage > 1 && flags[now^1] == 0);
         const bool isSolved = (isUnderWay && !isConverged);
 #if HAS_JOINTS
-        for (int b = THREAD; b < (isSolved ? numBorders : 0); b += NUM_THREADS) {
+        KEEP_LOOP for (int b = THREAD; b < (isSolved ? numBorders : 0); b += NUM_THREADS) {
             mixed sum = 0;
-            for (int j = 0; j < numJoints; j++)
+            KEEP_LOOP for (int j = 0; j < numJoints; j++)
                 sum += Z[b*numJoints+j]*jointSums[j];
             x[numInner+b] = (real) sum;
         }
@@ -551,7 +554,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                 phase == VELOCITIES ? (isLastProjection ? MULTIPLIERS : VELOCITIES) :
                 phase == MULTIPLIERS && mode == FINISH && HALF_SUMS ? HALF_MULTIPLIERS : COMPLETE);
         const bool isMeasured = (phase == MULTIPLIERS || phase == HALF_MULTIPLIERS);
-        for (int k = THREAD; k < (isUnderWay ? numRows : 0); k += NUM_THREADS) {
+        KEEP_LOOP for (int k = THREAD; k < (isUnderWay ? numRows : 0); k += NUM_THREADS) {
             if (phase == POSITIONS && !isConverged)
                 gamma[k] += x[k];
             if (mode == TRY && isConverged) {
@@ -577,9 +580,9 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             }
         }
         const bool isMoved = (phase == VELOCITIES ? isUnderWay : phase == POSITIONS && !isConverged);
-        for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
+        KEEP_LOOP for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
             real push[3] = {0, 0, 0};
-            for (int at = incidenceStart[i]; at < incidenceStart[i+1]; at++) {
+            KEEP_LOOP for (int at = incidenceStart[i]; at < incidenceStart[i+1]; at++) {
                 const int code = (int) incidence[at], k = code>>1; // of the second particle where it is odd
                 const real factor = ((code & 1) != 0 ? -x[k] : x[k]);
                 UNROLL for (int d = 0; d < 3; d++)
@@ -622,7 +625,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         SYNC_PIECE;
 
         // The next right-hand sides.
-        for (int k = THREAD; k < (phase != COMPLETE ? numRows : 0); k += NUM_THREADS) {
+        KEEP_LOOP for (int k = THREAD; k < (phase != COMPLETE ? numRows : 0); k += NUM_THREADS) {
             mixed right = 0;
             if (k < numInner) {
                 const int i = ends[2*k], j = ends[2*k+1];
@@ -647,13 +650,13 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         SYNC_PIECE;
         // At least one solution, since the multipliers of the state at the beginning are not those of the step.
         const bool isFine = (phase == POSITIONS && stage > 0 && flags[now] == 0);
-        for (int k = THREAD; k < (isFine ? numInner : 0); k += NUM_THREADS)
+        KEEP_LOOP for (int k = THREAD; k < (isFine ? numInner : 0); k += NUM_THREADS)
             x[k] = 0;
         RUN_FORWARD(phase == COMPLETE || isFine ? 0 : numLevels);
 #if HAS_JOINTS
         const word_t stamp = (task.stamp + (word_t) stage) | (phase == POSITIONS && !isFine ? 0x80000000u : 0u);
         GLOBAL volatile mm_ulong* outbox = channel + now*8*WORDS_PER_VALUE*numJoints;
-        for (int b = THREAD; b < (phase != COMPLETE ? numBorders : 0); b += NUM_THREADS) {
+        KEEP_LOOP for (int b = THREAD; b < (phase != COMPLETE ? numBorders : 0); b += NUM_THREADS) {
             const int joint = borders[b]>>1, side = borders[b] & 1, k = numInner + b, i = (side == 0 ? ends[2*k] : ends[2*k+1]);
             GLOBAL volatile mm_ulong* words = outbox + side*4*WORDS_PER_VALUE*numJoints + joint;
             sendValue(words, numJoints, x[k], stamp);
@@ -666,7 +669,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         fail(failure, task.step, IRREGULAR + NUM_CODES*piece);
 #if IN_LOCAL_MEMORY
     if (mode == FINISH)
-        for (int i = THREAD; i < numKept; i += NUM_THREADS)
+        KEEP_LOOP for (int i = THREAD; i < numKept; i += NUM_THREADS)
             kept[i] = A[i];
     SYNC_PIECE;
 #else
@@ -680,7 +683,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
 inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask task, GLOBAL mixed* RESTRICT partials, int numPartials, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS,
         LOCAL_ARG mixed* buffer, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
-    for (; piece < numPieces; piece += stride) {
+    KEEP_LOOP for (; piece < numPieces; piece += stride) {
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = halfSums[j] = 0;
         const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
@@ -703,7 +706,7 @@ inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask 
 inline DEVICE void tryPieces(int piece, int numPieces, int stride, LargeTask task, int isLast, GLOBAL mixed* RESTRICT nextPartials, int numPartials,
         LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG mixed* buffer, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
-    for (; piece < numPieces; piece += stride) {
+    KEEP_LOOP for (; piece < numPieces; piece += stride) {
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = halfSums[j] = 0;
         const int completed = runPiece(TRY, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
@@ -723,7 +726,7 @@ inline DEVICE void tryPieces(int piece, int numPieces, int stride, LargeTask tas
 inline DEVICE void advancePieces(int piece, int numPieces, int stride, LargeTask task, int isLast, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities,
         LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
-    for (; piece < numPieces; piece += stride) {
+    KEEP_LOOP for (; piece < numPieces; piece += stride) {
         const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, memory, flags);
         if (THREAD == 0 && isLast && (completed & 4) != 0)
             fail(failure, task.step, NOT_CONVERGED + NUM_CODES*piece);
