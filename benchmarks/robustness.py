@@ -138,7 +138,7 @@ def villin(constraints: object) -> Callable[[int], tuple[openmm.System, np.ndarr
         force_field = app.ForceField("amber14-all.xml", "implicit/obc2.xml")
         system = force_field.createSystem(modeller.topology, constraints=constraints, hydrogenMass=4 * unit.amu)
         plain = force_field.createSystem(modeller.topology)
-        context = openmm.Context(plain, openmm.VerletIntegrator(0.001))
+        context = openmm.Context(plain, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("CPU"))
         context.setPositions(modeller.positions)
         openmm.LocalEnergyMinimizer.minimize(context, 10, 200)
         return system, context.getState(positions=True).getPositions(asNumpy=True)._value, None

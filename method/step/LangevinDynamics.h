@@ -159,7 +159,8 @@ private:
     void takeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy);
     void evaluateOnStep();
     void settle();
-    void drawNoise();
+    void addNoise(Vectors& velocities);
+    template <class Task> void forParticles(const Task& task);
     void startAttempt();
     void raise(const std::string& reason);
     bool trySubstep(std::string& reason);
@@ -170,6 +171,8 @@ private:
     }
 
     ConstraintSolver solver;
+    Parallel parallel; // empty: one thread
+    int numThreads;
     ClusterForces clusterForces;
     Settings settings;
 
@@ -192,14 +195,14 @@ private:
     bool isInProgress;
     bool isAtStart;                      // the solver is at q[n]
     int doublings, substep;              // k and i
-    Vectors noise;                       // xi
     Vectors qNow, vNow, forceNow;        // at the beginning of a substep that is not the first
     Vectors qMiddle, wMiddle, noForce;   // in the middle of the central drift
     Vectors qNext, wNext, vNext;         // at its end, the velocities before the half kick and on step
     ExpressionParameters thetaNow, thetaMiddle, thetaNext;
     std::vector<double> parameterChange; // theta[n+1] - theta[n]
     std::vector<double> lambdaNow, lambdaNext, multipliers, noMultipliers, rightSide;
-    std::vector<double> clusterSums;     // A_c
+    std::vector<double> particleShares, clusterSums; // of A_c, and A_c
+    double systemSize;                   // S
 };
 
 } // namespace OpenMMVRattle

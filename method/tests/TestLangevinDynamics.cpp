@@ -371,6 +371,35 @@ void testReference() {
     ASSERT_EQUAL(7.0, dynamics.getReferences()[0]);
 }
 
+// The same to the last bit on any number of threads.
+void testThreads() {
+    vector<Vectors> ends;
+    for (int numThreads : {1, 2, 5}) {
+        Example e = makeComb(6000);
+        LangevinDynamics dynamics = makeDynamics(e);
+        int calls = 0;
+        dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
+        LangevinDynamics::Settings settings = makeSettings();
+        settings.stepSize = 0.001;
+        settings.tolerance = 1e-9; // for the comb is long
+        dynamics.setSettings(settings);
+        Vectors positions = e.positions;
+        dynamics.projectPositions(positions);
+        dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
+        for (int i = 0; i < 4; i++) {
+            Vectors forces;
+            do {
+                dynamics.step(INFINITY);
+                forces = forcesAt(dynamics.getNextPositions());
+            } while (!dynamics.finish(forces, 0));
+        }
+        ASSERT((calls > 0) == (numThreads > 1));
+        ends.push_back(dynamics.getPositions());
+    }
+    ASSERT(ends[0] == ends[1] && ends[0] == ends[2]);
+    ASSERT(largestDifference(ends[0], makeComb(6000).positions) > 1e-4);
+}
+
 } // namespace
 
 int main() {
@@ -381,5 +410,6 @@ int main() {
         {"RandomNumbers", testRandomNumbers},
         {"FailureLeavesTheState", testFailureLeavesTheState},
         {"Reference", testReference},
+        {"Threads", testThreads},
     });
 }

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 BOLTZMANN = 0.00831446261815324
-FLIGHT_LENGTH, POWER, TRIGGER, FLOOR, RATE = 0.0125, 2 / 3, 2.2, 0.5, 0.002
+FLIGHT_LENGTH, POWER, TRIGGER, FLOOR, FLOOR_PART, RATE = 0.0125, 2 / 3, 2.2, 0.5, 0.2, 0.002
 
 
 def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
@@ -138,7 +138,8 @@ class Statement:
 
     def step(self, q: np.ndarray, v: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """A step, and the k that it has taken."""
-        floor = FLOOR * np.sqrt(BOLTZMANN * max(self.temperature, 10)) / self.step_size
+        size = np.sum(np.bincount(self.clusters).astype(float) ** 4) ** 0.125
+        floor = max(FLOOR, FLOOR_PART * size) * np.sqrt(BOLTZMANN * max(self.temperature, 10)) / self.step_size
         u = self.monitor(q, v, self.force(q))
         if self.reference == 0:
             self.reference = min(max(u, floor), 4 * floor)

@@ -179,6 +179,53 @@ def test_without_friction_it_is_rattle() -> None:
     assert fluctuations[0] < 1.5 * fluctuations[1] < 0.5
 
 
+def test_a_damped_oscillator() -> None:
+    """At a temperature of zero: r - r0 goes as exp(-gamma t/2) cos(omega t)."""
+    system = openmm.System()
+    bond = openmm.HarmonicBondForce()
+    for _ in range(2):
+        system.addParticle(2.0)
+    bond.addBond(0, 1, 1.5, 1.0)
+    system.addForce(bond)
+    integrator = Langevin(0, 0.1, 0.01)
+    context = openmm.Context(system, integrator, REFERENCE)
+    context.setPositions([[-1, 0, 0], [1, 0, 0]])
+    omega = np.sqrt(1 - 0.05**2)
+    for _ in range(1000):
+        integrator.step(1)
+        t = context.getTime()._value
+        q, v = state_of(context)
+        decay = 0.5 * np.exp(-0.05 * t)
+        # To first order in gamma/omega, for the start is at rest and not on that curve.
+        assert q[1, 0] - q[0, 0] == pytest.approx(1.5 + decay * np.cos(omega * t), abs=0.03)
+        assert v[1, 0] - v[0, 0] == pytest.approx(-decay * omega * np.sin(omega * t), abs=0.03)
+
+
+@pytest.mark.parametrize("name", ["CPU", "OpenCL", "CUDA", "HIP"])
+def test_platforms_agree(name: str) -> None:
+    """With the same noise, to the precision of their forces."""
+    try:
+        platform = openmm.Platform.getPlatform(name)
+        openmm.Context(molecules()[0], openmm.VerletIntegrator(0.001), platform)
+    except openmm.OpenMMException as error:
+        pytest.skip(str(error))
+    ends = []
+    for each in (REFERENCE, platform):
+        integrator = Langevin(300, 5, 0.004, randomNumberSeed=7)
+        system, positions = molecules()
+        context = openmm.Context(system, integrator, each)
+        context.setPositions(positions)
+        integrator.setVelocitiesToTemperature(300, 1)
+        kinetic = []
+        for _ in range(10):
+            integrator.step(1)
+            kinetic.append(context.getState(energy=True).getKineticEnergy()._value)
+        ends.append((state_of(context)[0], kinetic, integrator.getNumForceEvaluations()))
+    assert np.max(np.abs(ends[0][0] - ends[1][0])) < 1e-4
+    assert ends[0][1] == pytest.approx(ends[1][1], rel=1e-2)
+    assert ends[0][2] == ends[1][2]
+
+
 def test_a_temperature_of_zero_cools() -> None:
     context, integrator = make_context(setTemperature=0, setFriction=50)
     integrator.step(500)

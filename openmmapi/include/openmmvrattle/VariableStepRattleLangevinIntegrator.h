@@ -24,7 +24,7 @@ namespace OpenMMVRattle {
  * that constraints join, f being the net force, applied and of constraints, and l = 0.0125 nm. k is the smallest number with
  * 2^k >= (U/U_ref)^(2/3)/2.2, chosen at the beginning of a step and made larger if the end of the step asks for it, or if its
  * equations could not be solved. U_ref is a running median of U, which changes by 0.2 % a step and is no less than
- * sqrt(kT)/(2H): see setReferenceMonitorValue().
+ * what thermal motion must have: see setReferenceMonitorValue().
  *
  * It is no minimiser: the heat of a clash is real, and leaves at the rate of the friction. And a calm system gains nothing
  * from it.
@@ -110,8 +110,8 @@ public:
     double getReferenceMonitorValue() const;
     /**
      * Set the reference value U_ref of the monitor, which then stays what it is. With 0, the default, it follows the run, as a running
-     * median: by 0.2 % a step up where U is larger, and down where it is smaller, but no lower than sqrt(kT)/(2H), with the kT of 10 K
-     * below that temperature. It begins as U at the first step, or four times that bound if that is less.
+     * median: by 0.2 % a step up where U is larger, and down where it is smaller, but no lower than max(1/2, S/5) sqrt(kT)/H, S = (sum_c
+     * N_c^4)^(1/8) with the numbers N_c of particles of the clusters, and with the kT of 10 K below that temperature. It begins as U at the first step, or four times that bound if that is less.
      *
      * @param value    the reference value in nm amu^(1/2)/ps^2, or 0
      */
