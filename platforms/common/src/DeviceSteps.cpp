@@ -26,8 +26,9 @@ const double MARGIN = 0.1;
 // In each launch the stages of large clusters have stamps of their own.
 const int STAMPS = 32;
 static_assert(StepProgram::MAX_STAGES < STAMPS, "stages of two launches would have the same stamp");
-// A factor in single precision solves to about 1e-7, so velocities are projected twice where more is asked for.
-const double SINGLE_PROJECTION = 1e-7;
+// A factor in single precision leaves about 1e-7 of what a projection changes in velocities, 1e-10 nm in a step: where more than that
+// is asked for they are projected twice.
+const double SINGLE_PROJECTION = 2e-9;
 
 // Local memory of a work group, of which every device of OpenCL has 32 kB, every GPU of NVIDIA 48.
 LargeClusters::Limits findLimits(OpenMM::ComputeContext& context) {

@@ -45,6 +45,10 @@
 #define FORWARD 1
 #define BACKWARD 2
 
+// 16-byte words of the tables and numbers of the factor that a thread loads while it waits for others.
+#define AHEAD 8
+#define KEPT_AHEAD 6
+
 #define IS_OWN(row) ((row).z >= 0)
 #define NUMBER_OF(row) ((row).z & 0x7fffffff)
 #define LOW(word) ((int) ((word) & 65535u))
@@ -252,13 +256,13 @@ inline DEVICE void sendValue(GLOBAL volatile mm_ulong* words, int stride, mixed 
 }
 
 /** Wait for some values; returns whether their sender has converged, which it has not if they do not come. */
-inline DEVICE bool receiveValues(const int count, GLOBAL volatile const mm_ulong* words, int stride, word_t stamp, mixed* values) {
+inline DEVICE bool receiveValues(const int count, GLOBAL volatile const mm_ulong* words, int valueStride, int stride, word_t stamp, mixed* values) {
     mm_ulong word[8*WORDS_PER_VALUE];
     bool isComplete = false;
     KEEP_LOOP for (int poll = 0; poll < MAX_POLLS && !isComplete; poll++) {
         isComplete = true;
         UNROLL for (int i = 0; i < count*WORDS_PER_VALUE; i++)
-            word[i] = words[i*stride];
+            word[i] = words[(i/WORDS_PER_VALUE)*valueStride + (i%WORDS_PER_VALUE)*stride];
         UNROLL for (int i = 0; i < count*WORDS_PER_VALUE; i++)
             isComplete = isComplete && ((word_t) (word[i] >> 32) & 0x7fffffffu) == stamp;
     }
@@ -309,14 +313,17 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     GLOBAL real* kept = factors + third.y;
     GLOBAL volatile mm_ulong* channel = exchange + fourth.x;
 #if IN_LOCAL_MEMORY
-    KEEP_LOOP for (int i = THREAD; i < first.y; i += NUM_THREADS)
-        memory[i] = allTables[first.x+i];
+    // On their way while the state is loaded.
+    uint4 tablesAhead[AHEAD];
+    real keptAhead[KEPT_AHEAD];
+    UNROLL for (int j = 0; j < AHEAD; j++)
+        tablesAhead[j] = allTables[first.x + (THREAD + j*NUM_THREADS < first.y ? THREAD + j*NUM_THREADS : 0)];
+    if (mode != FINISH)
+        UNROLL for (int j = 0; j < KEPT_AHEAD; j++)
+            keptAhead[j] = kept[THREAD + j*NUM_THREADS < numKept ? THREAD + j*NUM_THREADS : 0];
     MEMORY const uint4* tables = memory;
     MEMORY mixed* M = (MEMORY mixed*) (memory + fourth.y);
     MEMORY real* A = (MEMORY real*) (memory + fourth.z);
-    if (mode != FINISH)
-        KEEP_LOOP for (int i = THREAD; i < numKept; i += NUM_THREADS)
-            A[i] = kept[i];
 #else
     MEMORY const uint4* tables = allTables + first.x;
     MEMORY mixed* M = work + third.w;
@@ -382,7 +389,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             pulls[k] = pull;
         }
     }
-    KEEP_LOOP for (int j = THREAD; j < (isBeginning ? numJoints : 0); j += NUM_THREADS) {
+    // Other threads begin than above, so that not all is loaded one after the other.
+    KEEP_LOOP for (int j = NUM_THREADS - 1 - THREAD; j < (isBeginning ? numJoints : 0); j += NUM_THREADS) {
         const int4 joint = joints[firstJoint+j];
         const mixed length = jointLengths[firstJoint+j];
         mixed x1[3], x2[3], v[3], a1[3], a2[3], r[3];
@@ -400,7 +408,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             jointWeights[j] = (real) ((w1 + w2)*square);
         }
     }
-    KEEP_LOOP for (int i = THREAD; i < (isBeginning ? numAtoms : 0); i += NUM_THREADS) {
+    KEEP_LOOP for (int i = (THREAD + NUM_THREADS/2)%NUM_THREADS; i < (isBeginning ? numAtoms : 0); i += NUM_THREADS) {
         const int atom = pieceAtoms[firstAtom+i];
         mixed v[3], a[3];
         W[i] = loadVelocity(velm, atom, v);
@@ -422,6 +430,20 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     if (mode == FINISH)
         KEEP_LOOP for (int i = numRows + THREAD; i < (isBeginning ? numKept : 0); i += NUM_THREADS)
             A[i] = 0;
+#if IN_LOCAL_MEMORY
+    UNROLL for (int j = 0; j < AHEAD; j++)
+        if (THREAD + j*NUM_THREADS < first.y)
+            memory[THREAD + j*NUM_THREADS] = tablesAhead[j];
+    KEEP_LOOP for (int i = THREAD + AHEAD*NUM_THREADS; i < first.y; i += NUM_THREADS)
+        memory[i] = allTables[first.x+i];
+    if (mode != FINISH) {
+        UNROLL for (int j = 0; j < KEPT_AHEAD; j++)
+            if (THREAD + j*NUM_THREADS < numKept)
+                A[THREAD + j*NUM_THREADS] = keptAhead[j];
+        KEEP_LOOP for (int i = THREAD + KEPT_AHEAD*NUM_THREADS; i < numKept; i += NUM_THREADS)
+            A[i] = kept[i];
+    }
+#endif
     SYNC_PIECE;
     MEMORY const int* header = (MEMORY const int*) tables;
     MEMORY const index_t* indices = (MEMORY const index_t*) tables;
@@ -501,7 +523,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         GLOBAL volatile const mm_ulong* inbox = channel + (now ^ 1)*8*WORDS_PER_VALUE*numJoints;
         KEEP_LOOP for (int j = THREAD; j < (isUnderWay ? numJoints : 0); j += NUM_THREADS) {
             mixed sent[8], r[3], s[3];
-            bool isConverged = receiveValues(8, inbox + j, numJoints, lastStamp, sent);
+            bool isConverged = receiveValues(8, inbox + j, WORDS_PER_VALUE*numJoints, numJoints, lastStamp, sent);
             UNROLL for (int d = 0; d < 3; d++) {
                 r[d] = jointVectors[3*j+d];
                 s[d] = sent[1+d] - sent[5+d];
@@ -518,10 +540,14 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
         KEEP_LOOP for (int i = THREAD; i < isFresh*(numJoints + numJointEntries); i += NUM_THREADS) {
             mixed sum = 0;
-            KEEP_LOOP for (int at = sourceStart[i]; at < sourceStart[i+1]; at++) {
-                mixed value;
-                receiveValues(1, contributions + WORDS_PER_VALUE*sources[at], 1, task.stamp, &value);
-                sum += value;
+            // Two at once: a constraint has two ends.
+            const int end = sourceStart[i+1];
+            KEEP_LOOP for (int at = sourceStart[i]; at < end; at += 2) {
+                const bool isPair = (at + 1 < end);
+                mixed values[2];
+                receiveValues(2, contributions + WORDS_PER_VALUE*sources[at], WORDS_PER_VALUE*((int) sources[isPair ? at + 1 : at] - (int) sources[at]),
+                        1, task.stamp, values);
+                sum += values[0] + (isPair ? values[1] : (mixed) 0);
             }
             J[i] = (real) sum;
         }
@@ -582,12 +608,16 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         const bool isMoved = (phase == VELOCITIES ? isUnderWay : phase == POSITIONS && !isConverged);
         KEEP_LOOP for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
             real push[3] = {0, 0, 0};
-            KEEP_LOOP for (int at = incidenceStart[i]; at < incidenceStart[i+1]; at++) {
-                const int code = (int) incidence[at], k = code>>1; // of the second particle where it is odd
-                const real factor = ((code & 1) != 0 ? -x[k] : x[k]);
-                UNROLL for (int d = 0; d < 3; d++)
-                    push[d] += factor*R[3*k+d];
-            }
+            const int begin = incidenceStart[i], end = incidenceStart[i+1];
+            // Four at once, which are mostly all.
+            KEEP_LOOP for (int at = begin; at < end; at += 4)
+                UNROLL for (int j = 0; j < 4; j++) {
+                    const bool isThere = (at + j < end);
+                    const int code = (int) incidence[isThere ? at + j : at], k = code>>1; // of the second particle where it is odd
+                    const real factor = ((code & 1) != 0 ? -x[k] : x[k]);
+                    UNROLL for (int d = 0; d < 3; d++)
+                        push[d] += (isThere ? factor : (real) 0)*R[3*k+d];
+                }
             mixed v[3];
             const mixed w = W[i];
             UNROLL for (int d = 0; d < 3; d++)
@@ -612,7 +642,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                 mixed p[3];
                 const real charge = loadPosition(posq, posqCorrection, atom, p);
                 storePosition(posq, posqCorrection, atom, p[0] + v[0], p[1] + v[1], p[2] + v[2], charge);
-                velm[atom] = make_mixed4(v[0]/task.dt, v[1]/task.dt, v[2]/task.dt, w);
+                const mixed inverse = 1/task.dt;
+                velm[atom] = make_mixed4(v[0]*inverse, v[1]*inverse, v[2]*inverse, w);
             }
             UNROLL for (int d = 0; d < 3; d++)
                 D[3*i+d] = (mode == TRY && isConverged ? v[d]/task.dt : v[d]);
