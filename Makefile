@@ -88,8 +88,8 @@ docs: install $(DOCS_TOOLS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html."
 
-# A protein in water at constant energy beside VerletIntegrator: the table and the figure of docs/proof.md. PROOF_ARGUMENTS, for example
-# "--platform CUDA --time 100", and then it is put beside.
+# A protein in water at constant energy beside VerletIntegrator: the table and the figure of docs/proof.md. The 100 ps take an hour or
+# more on two cores; PROOF_ARGUMENTS="--time 10", for example, less, and "--platform CUDA" has a place of its own on the page.
 PROOF_ARGUMENTS ?=
 proof: install
 	$(BIN)/python benchmarks/proof.py --page $(PROOF_ARGUMENTS)
