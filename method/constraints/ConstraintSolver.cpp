@@ -38,12 +38,13 @@ ConstraintSolver::ConstraintSolver(const vector<double>& masses, const vector<Di
                                    const vector<ExpressionConstraint>& expressions) :
         system(masses, constraints, expressions), matrix(system), newtonMatrix(system), work(system), tolerance(1e-8),
         numIterations(0), lastError(0), q(nullptr), force(nullptr), theta(nullptr), factorScope(NoFactor),
-        acceleration(masses.size()), hasCorrection(false), isPieceEliminated(system.getPieces().size()) {
+        acceleration(masses.size()), isPieceEliminated(system.getPieces().size()) {
     for (int i = 0; i < system.getNumParticles(); i++)
         if (masses[i] > 0)
             movingParticles.push_back(i);
     for (vector<double>* numbers : {&appliedTerm, &appliedTermNext, &residual, &correction, &before})
         numbers->resize(system.getNumConstraints());
+    rangeResults.resize(SharedWork::getNumRanges(std::max(system.getNumParticles(), system.getNumConstraints())));
     for (ConstraintSystem::Jacobian* rows : {&jacobian, &jacobianNext, &velocityJacobian})
         rows->resize(system.getNumEntries());
 }
@@ -59,7 +60,8 @@ ConstraintSolver::ConstraintSolver(const vector<double>& masses, const vector<Di
 struct ConstraintSolver::Pass {
     /** The second may be null. */
     typedef std::array<vector<double>*, ConstraintMatrix::NUM_CHANNELS> Unknowns;
-    explicit Pass(ConstraintSolver& solver) : solver(solver), system(solver.system) {
+    explicit Pass(ConstraintSolver& solver, Observer* observer = nullptr) :
+            solver(solver), system(solver.system), observer(observer) {
     }
     int numStages() const {
         return 1;
@@ -68,7 +70,17 @@ struct ConstraintSolver::Pass {
     const ConstraintSystem::Jacobian* toFactorize() const {
         return nullptr;
     }
-    void seeBlock(int) const {
+    /** When all stages are over. */
+    void seeBlock(int block) const {
+        if (observer == nullptr)
+            return;
+        observer->seeParticles(block);
+        solver.forRangesOfBlock(block,
+                                [&](int range, int first, int end) { observer->seeConstraints(range, first, end); });
+    }
+    void seePart(const Part& part) const {
+        if (observer != nullptr)
+            observer->seeConstraints(solver.rangeOf(part), part.first, part.end);
     }
     /** Before everything else, and for joints before all pieces. */
     void prepare(const Part&) const {
@@ -86,6 +98,7 @@ struct ConstraintSolver::Pass {
     }
     ConstraintSolver& solver;
     const ConstraintSystem& system;
+    Observer* const observer;
 };
 
 // The chord iteration for (3.11), A = -kick drift K(q); each stage is an iteration.
@@ -97,16 +110,11 @@ struct ConstraintSolver::ChordPass : Pass {
     int numStages() const {
         return MAX_CHORD_ITERATIONS + 1;
     }
-    void start(int first, int end) const {
-        for (int k = first; k < end; k++)
-            trial.multipliers[k] =
-                guess.offset != nullptr ? guess.multipliers[k] + (*guess.offset)[k] : guess.multipliers[k];
-    }
     void prepare(const Part& part) const {
-        start(part.first, part.end);
+        solver.guess(trial, guess, part.first, part.end);
     }
     void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
-        start(batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
+        solver.guess(trial, guess, batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
         share.addError(batch.solvePositions(arrays, begin, end, aim, share.iterations));
     }
     void runFree(int particle) const {
@@ -141,16 +149,25 @@ struct ConstraintSolver::ChordPass : Pass {
 
 // One chord iteration with Lambda(q,p+), its only stage.
 struct ConstraintSolver::CoupledPass : Pass {
-    CoupledPass(ConstraintSolver& solver, const Trial& trial, const Coupled& coupled) :
-            Pass(solver), trial(trial), coupled(coupled), arrays(solver.arraysOf(trial)) {
+    CoupledPass(ConstraintSolver& solver, const Trial& trial, const Coupled& coupled, const Guess* guess,
+                Observer* observer) :
+            Pass(solver, observer), trial(trial), coupled(coupled), guess(guess), arrays(solver.arraysOf(trial)) {
         arrays.lambdaPlus = coupled.multipliers.data();
         arrays.rightSidePlus = coupled.rightSide.data();
     }
+    void start(int first, int end) const {
+        if (guess == nullptr)
+            return;
+        solver.guess(trial, *guess, first, end);
+        std::fill(solver.correction.begin() + first, solver.correction.begin() + end, 0.0);
+    }
     void prepare(const Part& part) const {
+        start(part.first, part.end);
         for (int k = part.first; k < part.end; k++)
             trial.multipliers[k] += solver.correction[k];
     }
     void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
+        start(batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
         share.addError(batch.coupledPass(arrays, begin, end));
     }
     void runFree(int particle) const {
@@ -174,13 +191,14 @@ struct ConstraintSolver::CoupledPass : Pass {
     }
     const Trial& trial;
     const Coupled& coupled;
+    const Guess* guess;
     StepArrays arrays;
 };
 
 // The end of a step. Stages: (3.13), (4.3), and what multipliers at half-step velocities take.
 struct ConstraintSolver::FinishPass : Pass {
     FinishPass(ConstraintSolver& solver, const OnStep& state, Observer* observer) :
-            Pass(solver), state(state), half(state.atHalfStep), observer(observer), jacobian(solver.jacobianNext),
+            Pass(solver, observer), state(state), half(state.atHalfStep), jacobian(solver.jacobianNext),
             arrays{state.positions.data(),
                    state.halfStep.data(),
                    state.forces.data(),
@@ -197,10 +215,6 @@ struct ConstraintSolver::FinishPass : Pass {
     }
     const ConstraintSystem::Jacobian* toFactorize() const {
         return &jacobian;
-    }
-    void seeBlock(int block) const {
-        if (observer != nullptr)
-            observer->see(block);
     }
     void prepare(const Part& part) const { // the joints' rows are in the columns of pieces
         system.evaluateJacobian(state.positions, state.parameters, jacobian, part);
@@ -260,7 +274,6 @@ struct ConstraintSolver::FinishPass : Pass {
     }
     const OnStep& state;
     HalfStep* half;
-    Observer* observer;
     ConstraintSystem::Jacobian& jacobian;
     const OnStepArrays arrays;
 };
@@ -307,6 +320,7 @@ template <class Each> void ConstraintSolver::runWhole(const Each& pass, const Pa
                 matrix.solve(*x, part);
         pass.update(part);
     }
+    pass.seePart(part);
     share.addError(error);
 }
 
@@ -346,6 +360,8 @@ template <class Each> void ConstraintSolver::runCut(const Each& pass, Result& re
             for (size_t channel = 0; channel < unknowns.size() && unknowns[channel] != nullptr; channel++)
                 matrix.solveJoints(*unknowns[channel], cluster, (int) channel);
             pass.update(cluster.joints);
+            if (stage + 1 == pass.numStages())
+                pass.seePart(cluster.joints);
         });
         const bool isMore = stage + 1 < pass.numStages();
         const Result pieces = work.runOnPieces([&](const Part& piece, Result& share) {
@@ -355,6 +371,8 @@ template <class Each> void ConstraintSolver::runCut(const Each& pass, Result& re
             pass.update(piece);
             if (isMore)
                 share.addError(beginStage(pass, stage + 1, piece));
+            else
+                pass.seePart(piece);
         });
         if (isMore)
             error = pieces.error;
@@ -389,6 +407,15 @@ void ConstraintSolver::ensureFactor(FactorScope scope) {
         matrix.throwDependent(failed, jacobian);
     system.multiplyOverMass(jacobian, *force, appliedTerm, part);
     factorScope = scope;
+}
+
+int ConstraintSolver::getNumRanges() const {
+    int numParts = 0; // the batches may be one too
+    for (const Part& part : system.getWholeParts())
+        numParts = std::max(numParts, part.index + 1);
+    for (const CutCluster& cluster : system.getCutClusters())
+        numParts = std::max(numParts, cluster.joints.index + 1);
+    return (int) ((system.getBlocks().size() - 1) * system.getBatches().size()) + numParts;
 }
 
 void ConstraintSolver::ensureGeneralFactor() {
@@ -565,20 +592,21 @@ bool ConstraintSolver::iterateNewton(const Trial& trial) {
 }
 
 void ConstraintSolver::guess(const Trial& trial, const Guess& guess) {
-    ChordPass(*this, trial, guess).start(0, system.getNumConstraints());
+    this->guess(trial, guess, 0, system.getNumConstraints());
 }
 
-void ConstraintSolver::beginCoupled(const Trial& trial, const Guess& guess) {
+void ConstraintSolver::guess(const Trial& trial, const Guess& guess, int first, int end) const {
+    const double *from = guess.multipliers.data(), *offset = guess.offset != nullptr ? guess.offset->data() : nullptr;
+    double* to = trial.multipliers.data();
+    for (int k = first; k < end; k++)
+        to[k] = offset != nullptr ? from[k] + offset[k] : from[k];
+}
+
+double ConstraintSolver::coupledPass(const Trial& trial, const Coupled& coupled, const Guess* start,
+                                     Observer* observer) {
     ensureGeneralFactor();
-    this->guess(trial, guess);
-    std::fill(correction.begin(), correction.end(), 0.0);
-    hasCorrection = false;
-}
-
-double ConstraintSolver::coupledPass(const Trial& trial, const Coupled& coupled) {
-    numIterations += hasCorrection;
-    hasCorrection = true;
-    return lastError = run(CoupledPass(*this, trial, coupled)).error;
+    numIterations += start == nullptr;
+    return lastError = run(CoupledPass(*this, trial, coupled, start, observer)).error;
 }
 
 double ConstraintSolver::evaluate(const Trial& trial) {

@@ -10,7 +10,9 @@
 #include "constraints/NewtonMatrix.h"
 #include "constraints/SharedWork.h"
 #include "constraints/StepFailure.h"
+#include "constraints/Sum.h"
 #include "openmm/Vec3.h"
+#include <algorithm>
 #include <string>
 #include <vector>
 
@@ -76,6 +78,57 @@ public:
         return numIterations;
     }
 
+    // ---------------------------------------------------------------------------------------------- what is done by many
+
+    /**
+     * What is done along with a pass, while the processor's caches have what has been worked on. Several threads may do it at once,
+     * each for other blocks and ranges; all of these come by, once in a pass.
+     */
+    class Observer {
+    public:
+        virtual ~Observer() {
+        }
+        /** A block of ConstraintSystem::getBlocks(). */
+        virtual void seeParticles(int) {
+        }
+        /** The multipliers first, ..., end - 1 are known; this is a range of getNumRanges(). */
+        virtual void seeConstraints(int, int, int) {
+        }
+    };
+    int getNumRanges() const;
+    /** Go through all ranges, task(range, first, end), on one thread. */
+    template <class Task> void forRanges(const Task& task) const {
+        for (size_t block = 0; block + 1 < system.getBlocks().size(); block++)
+            forRangesOfBlock((int) block, task);
+        auto runPart = [&](const ConstraintSystem::Part& part) { task(rangeOf(part), part.first, part.end); };
+        std::for_each(system.getGeneralParts().begin(), system.getGeneralParts().end(), runPart);
+        std::for_each(system.getPieces().begin(), system.getPieces().end(), runPart);
+        for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters())
+            runPart(cluster.joints);
+    }
+    /** Go through 0, ..., count - 1 in ranges of a fixed length, on several threads where that is faster: task(first, end). */
+    template <class Task> void share(int count, const Task& task) {
+        work.runOnRanges(count, [&](int, int first, int end) { task(first, end); });
+    }
+    /** The sum of term(0), ..., term(count - 1), and the largest, if it is not negative, for particles or constraints. */
+    template <class Term> double sum(int count, const Term& term) {
+        work.runOnRanges(count, [&](int range, int first, int end) {
+            rangeResults[range] = sumOf(end - first, [&](int i) { return term(first + i); });
+        });
+        return sumOf(SharedWork::getNumRanges(count), [&](int range) { return rangeResults[range]; });
+    }
+    template <class Term> double largest(int count, const Term& term) {
+        work.runOnRanges(count, [&](int range, int first, int end) {
+            double result = 0;
+            for (int i = first; i < end; i++)
+                result = std::max(result, term(i));
+            rangeResults[range] = result;
+        });
+        return SharedWork::getNumRanges(count) == 0
+                   ? 0.0
+                   : *std::max_element(rangeResults.begin(), rangeResults.begin() + SharedWork::getNumRanges(count));
+    }
+
     // ------------------------------------------------------------------------------------- at the positions of a step
 
     /**
@@ -135,15 +188,14 @@ public:
         const ExpressionParameters& parameters; // theta[n] with the rates of the trial
         std::vector<double>&multipliers, &rightSide; // Lambda(q,p+) and K times it
     };
-    /** Begin with a guess, for coupledPass(). */
-    void beginCoupled(const Trial& trial, const Guess& guess);
     /**
      * One chord iteration for a problem in which more is unknown than lambda. The multipliers get the correction that the pass
      * before has found; kick and drift may be others than there.
      *
+     * @param start    where to begin, for the first pass; else null
      * @return the largest relative error of a constraint at the trial's positions
      */
-    double coupledPass(const Trial& trial, const Coupled& coupled);
+    double coupledPass(const Trial& trial, const Coupled& coupled, const Guess* start, Observer* observer = nullptr);
 
     // Newton's iteration for such a problem, whose equations in lambda are A dlambda = -g + ..., A = -kick drift G(q+) M^-1 G(q)^T.
     /** w+, q+ and g(q+) for the trial's multipliers; returns the largest relative error. */
@@ -171,13 +223,6 @@ public:
         Vectors& velocities; // v
         std::vector<double>&multipliers, &rightSide; // Lambda and K Lambda
         HalfStep* atHalfStep; // or null if it is not wanted
-    };
-    /** What is done along with a pass, while the processor's caches have the particles of a block. Several threads may do it at once. */
-    class Observer {
-    public:
-        virtual ~Observer() {
-        }
-        virtual void see(int block) = 0;
     };
     /**
      * Complete a step. The positions of moveTo() remain, but what was known there has to be formed again.
@@ -221,6 +266,16 @@ private:
     struct ChordPass;
     struct CoupledPass;
     struct FinishPass;
+    int rangeOf(const Part& part) const {
+        return (int) ((system.getBlocks().size() - 1) * system.getBatches().size()) + part.index;
+    }
+    template <class Task> void forRangesOfBlock(int block, const Task& task) const {
+        const auto& batches = system.getBatches();
+        for (size_t k = 0; k < batches.size(); k++)
+            task((int) (block * batches.size() + k),
+                 batches[k]->getFirstConstraint(system.getBlocks()[block].clusters[k]),
+                 batches[k]->getFirstConstraint(system.getBlocks()[block + 1].clusters[k]));
+    }
     template <class Each> Result run(const Each& pass);
     template <class Each> void runWhole(const Each& pass, const Part& part, Result& share);
     template <class Each> double beginStage(const Each& pass, int stage, const Part& piece);
@@ -233,6 +288,7 @@ private:
     void moveParticles(const Trial& trial, const int* first, const int* end, const Part& part, bool withVelocities);
     void moveParticles(const Trial& trial, const Part& part, bool withVelocities);
     void moveFreeParticle(const Trial& trial, int i);
+    void guess(const Trial& trial, const Guess& guess, int first, int end) const;
     bool solveByNewton(const Trial& trial, const Guess& guess);
     bool iterateNewton(const Trial& trial);
     bool projectByChord(const ExpressionParameters& theta, Vectors& positions);
@@ -261,6 +317,7 @@ private:
     std::vector<double> appliedTermNext, residual, correction, before;
     Vectors acceleration;
     bool hasCorrection; // whether the next coupledPass() has one to apply
+    std::vector<double> rangeResults;
     std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the unknowns of a piece
 };
 

@@ -73,10 +73,10 @@ public:
     }
 
     /**
-     * Go through all particles block by block, calling blockTask(block), a task for what each batch has there, batchTask(batch, first
-     * cluster, end, result), and one for particles without constraints, freeTask(particle); then through the parts of whole clusters,
-     * partTask(part, result), and the pieces of those that are cut, pieceTask(piece, result). A cluster is worked on in the same lane
-     * of a pack whatever the number of threads, since blocks begin at whole packs.
+     * Go through all particles block by block, calling a task for what each batch has there, batchTask(batch, first cluster, end,
+     * result), one for particles without constraints, freeTask(particle), and at the end of each block blockTask(block); then through
+     * the parts of whole clusters, partTask(part, result), and the pieces of those that are cut, pieceTask(piece, result). A cluster
+     * is worked on in the same lane of a pack whatever the number of threads, since blocks begin at whole packs.
      */
     template <class BlockTask, class BatchTask, class FreeTask, class PartTask, class PieceTask>
     Result run(const BlockTask& blockTask, const BatchTask& batchTask, const FreeTask& freeTask,
@@ -86,7 +86,6 @@ public:
         const std::vector<int>& freeParticles = system.getFreeParticles();
         return runOnThreads([&](int thread, int numThreads, Result& result) {
             forShare(blocks.size() - 1, thread, numThreads, [&](size_t b) {
-                blockTask((int) b);
                 for (size_t k = 0; k < batches.size(); k++) {
                     const int first = blocks[b].clusters[k], end = blocks[b + 1].clusters[k];
                     if (first < end)
@@ -94,6 +93,7 @@ public:
                 }
                 for (int k = blocks[b].freeParticle; k < blocks[b + 1].freeParticle; k++)
                     freeTask(freeParticles[k]);
+                blockTask((int) b);
             });
             forShare(system.getGeneralParts().size(), thread, numThreads,
                      [&](size_t k) { partTask(system.getGeneralParts()[k], result); });
@@ -108,6 +108,19 @@ public:
         return runOnThreads([&](int thread, int numThreads, Result& result) {
             forShare(system.getPieces().size(), thread, numThreads,
                      [&](size_t k) { task(system.getPieces()[k], result); });
+        });
+    }
+    /** Go through 0, ..., count - 1 in ranges of RANGE_SIZE, the last of which may be shorter: task(number of the range, first, end). */
+    static constexpr int RANGE_SIZE = 1024;
+    static int getNumRanges(int count) {
+        return (count + RANGE_SIZE - 1) / RANGE_SIZE;
+    }
+    template <class Task> void runOnRanges(int count, const Task& task) {
+        runOnThreads([&](int thread, int numThreads, Result&) {
+            forShare(getNumRanges(count), thread, numThreads, [&](size_t range) {
+                const int first = (int) range * RANGE_SIZE;
+                task((int) range, first, std::min(count, first + RANGE_SIZE));
+            });
         });
     }
     /** Run a task on each cut cluster, for its joints, when that on the pieces has ended: task(cluster). */

@@ -166,13 +166,13 @@ std::string AutomaticSteps::explainStep() const {
     return text.str();
 }
 
-ConstraintSolver::Observer* AutomaticSteps::observe(const vector<Vec3>& forces) {
-    forcesAhead = &forces;
+ConstraintSolver::Observer* AutomaticSteps::observe(const ConstraintSolver::OnStep& end) {
+    forcesAhead = &end.forces;
     return this;
 }
 
 // The force on a particle that does not move is of no interest, even if it is not a number.
-void AutomaticSteps::see(int block) {
+void AutomaticSteps::seeParticles(int block) {
     const ConstraintSystem& system = constraints.getSystem();
     double sum = 0;
     for (int i = system.getBlocks()[block].particle; i < system.getBlocks()[block + 1].particle; i++)
@@ -185,7 +185,7 @@ void AutomaticSteps::requireFiniteForces(const vector<Vec3>& forces) {
     if (forcesAhead != &forces) {
         forcesAhead = &forces;
         for (size_t block = 0; block < blockSums.size(); block++)
-            see((int) block);
+            seeParticles((int) block);
     }
     forcesAhead = nullptr;
     for (double sum : blockSums)

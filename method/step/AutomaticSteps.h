@@ -33,7 +33,7 @@ public:
     bool start() override;
     void findFirstDensity() override;
     void solve() override;
-    ConstraintSolver::Observer* observe(const std::vector<OpenMM::Vec3>& forces) override;
+    ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) override;
     bool measure(const End& end) override;
     void accept(const End& end) override;
     void settle(StepKind kind) override;
@@ -41,7 +41,7 @@ public:
 
 private:
     std::string explainStep() const override;
-    void see(int block) override;
+    void seeParticles(int block) override;
     AutomaticControl::State stateOf(const StepState& state, const std::vector<OpenMM::Vec3>& forces) const;
     void applySettings(const StepSettings& newSettings);
     void requireFiniteForces(const std::vector<OpenMM::Vec3>& forces);

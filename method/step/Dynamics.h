@@ -36,6 +36,8 @@ public:
      * threads, to the last bit.
      */
     virtual void setParallel(const Parallel& parallel, int numThreads) = 0;
+    /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
+    virtual void share(int count, const std::function<void(int, int)>& task) = 0;
 
     /**
      * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;

@@ -58,6 +58,9 @@ public:
     LangevinDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                      const std::vector<ExpressionConstraint>& expressions = {});
     void setParallel(const Parallel& parallel, int numThreads) override;
+    void share(int count, const std::function<void(int, int)>& task) override {
+        solver.share(count, task);
+    }
     void setSettings(const Settings& newSettings);
 
     bool projectPositions(std::vector<OpenMM::Vec3>& positions) override;

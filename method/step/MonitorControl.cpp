@@ -19,9 +19,9 @@ const double SMALL_JUMP = 0.01;
 } // namespace
 
 MonitorControl::MonitorControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
-        StepControl(constraints, solver, now), monitor(constraints), mustForget(false), u(1), hasHalfStepValue(false),
-        halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false), isMonitorCurrent(false),
-        forcesAhead(nullptr), densityScale(1), isRescued(false), numRescues(0), isStart(false), hasBack(false) {
+        StepControl(constraints, solver, now), monitor(constraints), observer(monitor), mustForget(false), u(1),
+        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false),
+        isMonitorCurrent(false), densityScale(1), isRescued(false), numRescues(0), isStart(false), hasBack(false) {
     const ConstraintSystem& system = constraints.getSystem();
     for (vector<double>* numbers : {&multiplierTrial, &rightSideTrial, &back.lambda, &back.rightSide})
         numbers->resize(system.getNumConstraints());
@@ -130,7 +130,7 @@ void MonitorControl::ensureMonitor() {
 // U_k at the present state
 void MonitorControl::look() {
     ensureMonitor();
-    monitor.evaluate(now.v, now.lambda, now.rightSide, values);
+    monitor.evaluate(now.v, now.lambda, monitor.sum({now.lambda, now.rightSide, nullptr}), values);
     hasHalfStepValue = false;
 }
 
@@ -141,20 +141,20 @@ double MonitorControl::combineAndLimit(const vector<double>& monitorValues) cons
 // u(q,p) with Lambda(q,p) (4.3)
 double MonitorControl::evaluateU(const vector<Vec3>& velocities, const ExpressionParameters& theta) {
     constraints.findMultipliers(velocities, theta, multiplierTrial, rightSideTrial);
-    return evaluateU(velocities, multiplierTrial, rightSideTrial);
+    return evaluateU(velocities, multiplierTrial, monitor.sum({multiplierTrial, rightSideTrial, nullptr}));
 }
 
 double MonitorControl::evaluateU(const vector<Vec3>& velocities, const vector<double>& multipliers,
-                                 const vector<double>& rightSide) {
+                                 const StepMonitor::Sums& sums) {
     ensureMonitor();
-    monitor.evaluate(velocities, multipliers, rightSide, valuesTrial);
+    monitor.evaluate(velocities, multipliers, sums, valuesTrial);
     return combineAndLimit(valuesTrial);
 }
 
 void MonitorControl::begin() {
     forget();
     densityOffset = 0;
-    forcesAhead = nullptr;
+    observer.forces = nullptr;
     measureAt(now, now.force, now.groupEnergy, values);
     isMonitorCurrent = true;
     back.q = now.q; // for the sake of particles without mass, which stay as they are
@@ -292,9 +292,17 @@ MonitorControl::Equation::Equation(MonitorControl& control) : control(control) {
     rate = control.rate;
 }
 
-double MonitorControl::Equation::evaluate(const vector<Vec3>& w, const vector<double>& multipliers,
-                                          const vector<double>& rightSide) {
-    return control.evaluateU(w, multipliers, rightSide);
+ConstraintSolver::Observer* MonitorControl::Equation::observe(const vector<double>& multipliers,
+                                                              const vector<double>& rightSide) {
+    control.observer.forces = nullptr;
+    control.observer.multipliers = &multipliers;
+    control.observer.rightSide = &rightSide;
+    control.observer.half = nullptr;
+    return &control.observer;
+}
+
+double MonitorControl::Equation::evaluate(const vector<Vec3>& w, const vector<double>& multipliers) {
+    return control.evaluateU(w, multipliers, control.observer.sums);
 }
 
 void MonitorControl::Equation::findGradient(const vector<Vec3>& w, const ExpressionParameters& theta,
@@ -314,34 +322,46 @@ std::string MonitorControl::explainStep() const {
     return text.str();
 }
 
-ConstraintSolver::Observer* MonitorControl::observe(const vector<Vec3>& forces) {
+ConstraintSolver::Observer* MonitorControl::observe(const ConstraintSolver::OnStep& end) {
     isMonitorCurrent = false;
-    forcesAhead = &forces;
-    return this;
+    observer.forces = &end.forces;
+    observer.multipliers = &end.multipliers;
+    observer.rightSide = &end.rightSide;
+    observer.half = end.atHalfStep;
+    return &observer;
 }
 
-void MonitorControl::see(int block) {
-    monitor.sumForces(*forcesAhead, block);
+void MonitorControl::SumObserver::seeParticles(int block) {
+    if (forces != nullptr)
+        monitor.sumForces(*forces, block);
 }
 
-// The monitors at a state whose forces have been summed, or are to be.
+void MonitorControl::SumObserver::seeConstraints(int range, int first, int end) {
+    monitor.sumRange({*multipliers, *rightSide, half != nullptr ? &half->rate : nullptr}, range, first, end, sums);
+    if (half != nullptr)
+        monitor.sumRange({half->multipliers, half->rightSide, nullptr}, range, first, end, halfSums);
+}
+
+// The monitors at a state that has been observed, or has not.
 void MonitorControl::measureAt(const StepState& state, const vector<Vec3>& forces, double groupEnergy,
                                vector<double>& monitorValues) {
-    if (forcesAhead == &forces)
+    if (observer.forces == &forces)
         monitor.finishForces(forces, groupEnergy);
-    else
+    else {
         monitor.setForces(forces, groupEnergy);
-    forcesAhead = nullptr;
+        observer.sums = monitor.sum({state.lambda, state.rightSide, nullptr});
+    }
+    observer.forces = nullptr;
     if (!monitor.hasFiniteForces())
         throw StepFailure("the force on a particle is infinite or not a number");
-    monitor.evaluate(state.v, state.lambda, state.rightSide, monitorValues);
+    monitor.evaluate(state.v, state.lambda, observer.sums, monitorValues);
     monitor.requireValid(monitorValues);
 }
 
 bool MonitorControl::measure(const End& end) {
     measureAt(end.state, end.forces, end.groupEnergy, valuesNext);
     if (end.atHalfStep != nullptr)
-        monitor.evaluate(end.state.w, end.atHalfStep->multipliers, end.atHalfStep->rightSide, valuesHalf);
+        monitor.evaluate(end.state.w, end.atHalfStep->multipliers, observer.halfSums, valuesHalf);
     return !isStart || startDensity();
 }
 
@@ -357,7 +377,7 @@ void MonitorControl::accept(const End& end) {
     hasHalfStepValue = end.atHalfStep != nullptr;
     if (hasHalfStepValue) {
         halfStepValue = combineAndLimit(valuesHalf);
-        rate = evaluateRate(end.state, end.atHalfStep->rate);
+        rate = evaluateRate(end);
     }
 }
 
@@ -377,7 +397,8 @@ void MonitorControl::settle(StepKind kind) {
 }
 
 // The change of u along F - G^T Lambda, of the on-step state that is about to be taken over.
-double MonitorControl::evaluateRate(const StepState& state, const vector<double>& multiplierRate) {
+double MonitorControl::evaluateRate(const End& end) {
+    const StepState& state = end.state;
     if (monitor.usesVelocities()) {
         const vector<double>& inverseMasses = constraints.getSystem().getInverseMasses();
         for (int i : constraints.getMovingParticles())
@@ -385,7 +406,8 @@ double MonitorControl::evaluateRate(const StepState& state, const vector<double>
         constraints.subtractConstraintAccelerations(state.q, state.theta, state.lambda, acceleration);
     }
     return density.limitDerivative(monitor.combine(valuesNext)) *
-           monitor.evaluateRate(state.v, state.lambda, state.rightSide, valuesNext, acceleration, multiplierRate);
+           monitor.evaluateRate(state.v, {state.lambda, state.rightSide, &end.atHalfStep->rate}, observer.sums,
+                                valuesNext, acceleration);
 }
 
 void MonitorControl::abandon() {
@@ -464,9 +486,9 @@ bool MonitorControl::evaluateBackwards(const vector<Vec3>& forces, double groupE
     for (int i = 0; i < system.getNumParticles(); i++)
         back.force[i] = now.force[i] + (forces[i] - now.force[i]) * alpha;
     try {
-        constraints.finish(
-            {back.q, back.w, back.force, back.theta, -0.5 * size, back.v, back.lambda, back.rightSide, nullptr},
-            observe(back.force));
+        const ConstraintSolver::OnStep end = {back.q, back.w,      back.force,     back.theta, -0.5 * size,
+                                              back.v, back.lambda, back.rightSide, nullptr};
+        constraints.finish(end, observe(end));
         measureAt(back, back.force, now.groupEnergy + alpha * (groupEnergy - now.groupEnergy), backValues);
     }
     catch (const StepFailure&) {

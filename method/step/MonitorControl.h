@@ -13,7 +13,7 @@
 namespace OpenMMVRattle {
 
 /** The paper's control: monitors U_k, u = B(U/U_ref) of them, and a symmetric recursion of the density, (3.14), (3.15) or bounded. */
-class MonitorControl : public StepControl, private ConstraintSolver::Observer {
+class MonitorControl : public StepControl {
 public:
     MonitorControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now);
     /** Throws a StepFailure if any of some terms is defined by constraints, and there are none. */
@@ -37,7 +37,7 @@ public:
     void solve() override;
     bool needsHalfStep() const override;
     void lookBack(const std::vector<OpenMM::Vec3>& forces, double groupEnergy, StepKind kind, double size) override;
-    ConstraintSolver::Observer* observe(const std::vector<OpenMM::Vec3>& forces) override;
+    ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) override;
     bool measure(const End& end) override;
     void accept(const End& end) override;
     void settle(StepKind kind) override;
@@ -55,18 +55,30 @@ public:
 
 private:
     std::string explainStep() const override;
-    void see(int block) override;
+    /** Makes the sums of a pass, at one or two sets of multipliers. */
+    struct SumObserver : ConstraintSolver::Observer {
+        explicit SumObserver(StepMonitor& monitor) : monitor(monitor), sums(monitor.makeSums()), halfSums(sums) {
+        }
+        void seeParticles(int block) override;
+        void seeConstraints(int range, int first, int end) override;
+        StepMonitor& monitor;
+        const std::vector<OpenMM::Vec3>* forces = nullptr;
+        const std::vector<double>*multipliers = nullptr, *rightSide = nullptr;
+        const ConstraintSolver::HalfStep* half = nullptr;
+        StepMonitor::Sums sums, halfSums;
+    };
     /** (3.14) */
     struct Equation : DensityEquation {
         explicit Equation(MonitorControl& control);
-        double evaluate(const std::vector<OpenMM::Vec3>& w, const std::vector<double>& multipliers,
-                        const std::vector<double>& rightSide) override;
+        ConstraintSolver::Observer* observe(const std::vector<double>& multipliers,
+                                            const std::vector<double>& rightSide) override;
+        double evaluate(const std::vector<OpenMM::Vec3>& w, const std::vector<double>& multipliers) override;
         void findGradient(const std::vector<OpenMM::Vec3>& w, const ExpressionParameters& theta,
                           const std::vector<double>& multipliers, std::vector<OpenMM::Vec3>& gradient) override;
         MonitorControl& control;
     };
     double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const std::vector<double>& multipliers,
-                     const std::vector<double>& rightSide);
+                     const StepMonitor::Sums& sums);
     void applySettings(const StepSettings& newSettings, const std::vector<StepMonitor::Term>& terms);
     void ensureMonitor();
     void look();
@@ -76,7 +88,7 @@ private:
     double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& theta);
     void measureAt(const StepState& state, const std::vector<OpenMM::Vec3>& forces, double groupEnergy,
                    std::vector<double>& monitorValues);
-    double evaluateRate(const StepState& state, const std::vector<double>& multiplierRate);
+    double evaluateRate(const End& end);
     bool evaluateBackwards(const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double size);
     std::vector<double> evaluateHalfSteps(double size);
     bool startDensity();
@@ -84,6 +96,7 @@ private:
     static double startValue(double start, double ahead, const double* back);
 
     StepMonitor monitor;
+    SumObserver observer;
     StepDensity density;
     bool mustForget; // the densities, for the sake of new settings
     double u; // u(q[n],p[n])
@@ -97,7 +110,6 @@ private:
     bool isMonitorCurrent; // whether the monitor has the forces at q[n]
 
     // The step in progress.
-    const std::vector<OpenMM::Vec3>* forcesAhead;
     double densityScale; // by which u and rho change where the parameters begin to move, or stop
     std::vector<double> valuesNext, valuesHalf, valuesTrial, multiplierTrial, rightSideTrial;
     std::vector<OpenMM::Vec3> acceleration;

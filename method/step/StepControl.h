@@ -116,7 +116,7 @@ public:
     virtual void lookBack(const std::vector<OpenMM::Vec3>&, double, StepKind, double) {
     }
     /** What is to be done along with the solution at its end. */
-    virtual ConstraintSolver::Observer* observe(const std::vector<OpenMM::Vec3>& forces) = 0;
+    virtual ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) = 0;
     /**
      * Look at the end of the step; nothing is taken over.
      *

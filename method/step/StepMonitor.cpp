@@ -12,29 +12,6 @@ using std::vector;
 
 namespace {
 
-// The sum of term(0), ..., term(count - 1) in four interleaved parts: a processor waits for each addition to one number, and
-// adds to several at a time.
-template <class Term> double sumOf(int count, Term term) {
-    double part[4] = {0, 0, 0, 0};
-    int i = 0;
-    for (; i + 4 <= count; i += 4)
-        for (int j = 0; j < 4; j++)
-            part[j] += term(i + j);
-    for (; i < count; i++)
-        part[0] += term(i);
-    return (part[0] + part[1]) + (part[2] + part[3]);
-}
-
-// (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
-template <class Size> double pNorm(int count, double order, Size size) {
-    double largest = 0;
-    for (int i = 0; i < count; i++)
-        largest = std::max(largest, size(i));
-    if (largest == 0)
-        return 0;
-    return largest * std::pow(sumOf(count, [&](int i) { return std::pow(size(i) / largest, order); }), 1 / order);
-}
-
 bool usesConstraintsOnly(StepMonitor::Kind kind) {
     return kind == StepMonitor::ConstraintMultipliers || kind == StepMonitor::ConstraintForce ||
            kind == StepMonitor::MultiplierPNorm;
@@ -53,7 +30,8 @@ bool isOfVelocities(StepMonitor::Kind kind) {
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
         solver(solver), system(solver.getSystem()), forces(nullptr), groupEnergy(0), appliedForceSquared(0),
-        forceSquared(0), maxForce(0), constraintForceSquared(0), blockSums(system.getBlocks().size() - 1),
+        forceSquared(0), maxForce(0), constraintForceSquared(0), multipliersSquared(0),
+        blockSums(system.getBlocks().size() - 1), blockAppliedSums(blockSums.size()), blockLargest(blockSums.size()),
         toSolve(system.getNumConstraints()), solved(system.getNumConstraints()) {
 }
 
@@ -99,40 +77,85 @@ double StepMonitor::squareOf(const Vec3& force, int particle) const {
     return system.getInverseMasses()[particle] > 0 ? force.dot(force) : 0.0;
 }
 
+bool StepMonitor::isWanted(std::initializer_list<Kind> kinds) const {
+    return std::any_of(terms.begin(), terms.end(), [&](const Term& term) {
+        return std::find(kinds.begin(), kinds.end(), term.kind) != kinds.end();
+    });
+}
+
 void StepMonitor::sumForces(const vector<Vec3>& newForces, int block) {
     const int first = system.getBlocks()[block].particle, end = system.getBlocks()[block + 1].particle;
-    blockSums[block] = sumOf(end - first, [&](int i) { return squareOf(newForces[first + i], first + i); });
+    const vector<double>& inverseMasses = system.getInverseMasses();
+    auto square = [&](int i) { return squareOf(newForces[first + i], first + i); };
+    blockSums[block] = sumOf(end - first, square);
+    if (isWanted({AppliedForce, ConstraintAndAppliedForce}))
+        blockAppliedSums[block] = sumOf(end - first, [&](int i) { return square(i) * inverseMasses[first + i]; });
+    if (isWanted({MaxForce})) {
+        blockLargest[block] = 0;
+        for (int i = 0; i < end - first; i++)
+            blockLargest[block] = std::max(blockLargest[block], square(i));
+    }
 }
 
 void StepMonitor::finishForces(const vector<Vec3>& newForces, double energy) {
     forces = &newForces;
     groupEnergy = energy;
-    appliedForceSquared = forceSquared = maxForce = 0;
-    const vector<double>& inverseMasses = system.getInverseMasses();
-    const int numParticles = system.getNumParticles();
-    auto squareOf = [&](int i) { return this->squareOf(newForces[i], i); };
-    auto isWanted = [&](std::initializer_list<Kind> kinds) {
-        return std::any_of(terms.begin(), terms.end(), [&](const Term& term) {
-            return std::find(kinds.begin(), kinds.end(), term.kind) != kinds.end();
-        });
-    };
-    forceSquared = sumOf((int) blockSums.size(), [&](int block) { return blockSums[block]; });
-    if (isWanted({AppliedForce, ConstraintAndAppliedForce}))
-        appliedForceSquared = sumOf(numParticles, [&](int i) { return squareOf(i) * inverseMasses[i]; });
-    if (isWanted({MaxForce}))
-        for (int i = 0; i < numParticles; i++)
-            maxForce = std::max(maxForce, squareOf(i));
+    const int numBlocks = (int) blockSums.size();
+    forceSquared = sumOf(numBlocks, [&](int block) { return blockSums[block]; });
+    appliedForceSquared = sumOf(numBlocks, [&](int block) { return blockAppliedSums[block]; });
+    maxForce = 0;
+    for (double square : blockLargest)
+        maxForce = std::max(maxForce, square);
     maxForce = std::sqrt(maxForce);
     for (size_t k = 0; k < terms.size(); k++)
         if (terms[k].kind == ForcePNorm)
-            forcePNorms[k] = pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(squareOf(i)); });
+            forcePNorms[k] = pNorm(system.getNumParticles(), terms[k].order,
+                                   [&](int i) { return std::sqrt(squareOf(newForces[i], i)); });
 }
 
-void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const vector<double>& rightSide,
+// (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
+template <class Size> double StepMonitor::pNorm(int count, double order, const Size& size) const {
+    const double largest = solver.largest(count, size);
+    if (largest == 0)
+        return 0;
+    return largest * std::pow(solver.sum(count, [&](int i) { return std::pow(size(i) / largest, order); }), 1 / order);
+}
+
+StepMonitor::Sums StepMonitor::makeSums() const {
+    const vector<double> zeros(solver.getNumRanges(), 0.0);
+    return {zeros, zeros, zeros, zeros};
+}
+
+void StepMonitor::sumRange(const Multipliers& at, int range, int first, int end, Sums& sums) const {
+    const double *lambda = at.multipliers.data() + first, *right = at.rightSide.data() + first;
+    sums.forces[range] = sumOf(end - first, [&](int k) { return lambda[k] * right[k]; });
+    const double* rate = at.rate != nullptr ? at.rate->data() + first : nullptr;
+    if (rate != nullptr)
+        sums.forceRates[range] = sumOf(end - first, [&](int k) { return right[k] * rate[k]; });
+    if (!isWanted({ConstraintMultipliers}))
+        return;
+    auto given = [&](int k, double x) { return system.toGivenMultiplier(first + k) * x; };
+    sums.multipliers[range] = sumOf(end - first, [&](int k) { return given(k, lambda[k]) * given(k, lambda[k]); });
+    if (rate != nullptr)
+        sums.multiplierRates[range] =
+            sumOf(end - first, [&](int k) { return given(k, lambda[k]) * given(k, rate[k]); });
+}
+
+StepMonitor::Sums StepMonitor::sum(const Multipliers& at) const {
+    Sums sums = makeSums();
+    solver.forRanges([&](int range, int first, int end) { sumRange(at, range, first, end, sums); });
+    return sums;
+}
+
+void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const Sums& sums,
                            vector<double>& values) {
+    auto add = [](const vector<double>& parts) {
+        return sumOf((int) parts.size(), [&](int range) { return parts[range]; });
+    };
     // Lambda^T K Lambda; rounding could make it negative where it vanishes.
-    const double sum = sumOf((int) multipliers.size(), [&](int k) { return multipliers[k] * rightSide[k]; });
+    const double sum = add(sums.forces);
     constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
+    multipliersSquared = add(sums.multipliers);
     values.resize(terms.size());
     for (size_t i = 0; i < terms.size(); i++)
         values[i] = evaluateTerm(i, v, multipliers);
@@ -164,49 +187,42 @@ int StepMonitor::findFastest(const vector<Vec3>& v) const {
     return fastest;
 }
 
-double StepMonitor::evaluateRate(const vector<Vec3>& v, const vector<double>& multipliers,
-                                 const vector<double>& rightSide, const vector<double>& values,
-                                 const vector<Vec3>& velocityRate, const vector<double>& multiplierRate) const {
-    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+double StepMonitor::evaluateRate(const vector<Vec3>& v, const Multipliers& at, const Sums& sums,
+                                 const vector<double>& values, const vector<Vec3>& velocityRate) const {
+    const int numParticles = system.getNumParticles();
+    auto add = [](const vector<double>& parts) {
+        return sumOf((int) parts.size(), [&](int range) { return parts[range]; });
+    };
     const double u = combine(values);
     double rate = 0;
     for (size_t i = 0; i < terms.size(); i++) {
         const double factor = derivativeOfU(i, values, u), value = values[i];
         if (factor == 0)
             continue;
-        double sum = 0;
         switch (terms[i].kind) {
         case ConstraintMultipliers:
-            sum = sumOf(numConstraints, [&](int k) {
-                double d = system.toGivenMultiplier(k);
-                return d * d * multipliers[k] * multiplierRate[k];
-            });
-            rate += factor * sum / value;
+            rate += factor * add(sums.multiplierRates) / value;
             break;
         case MultiplierPNorm:
-            for (int k = 0; k < numConstraints; k++) {
-                double x = system.toGivenMultiplier(k) * multipliers[k];
-                sum += std::copysign(std::pow(std::fabs(x) / value, terms[i].order - 1), x) *
-                       system.toGivenMultiplier(k) * multiplierRate[k];
-            }
-            rate += factor * sum;
+            rate += factor * solver.sum(system.getNumConstraints(), [&](int k) {
+                const double x = system.toGivenMultiplier(k) * at.multipliers[k];
+                return std::copysign(std::pow(std::fabs(x) / value, terms[i].order - 1), x) *
+                       system.toGivenMultiplier(k) * (*at.rate)[k];
+            });
             break;
         case ConstraintForce:
         case ConstraintAndAppliedForce:
-            sum = sumOf(numConstraints, [&](int k) { return rightSide[k] * multiplierRate[k]; });
-            rate += factor * sum / value;
+            rate += factor * add(sums.forceRates) / value;
             break;
         case VectorField:
-            for (int p = 0; p < numParticles; p++)
-                if (system.getMasses()[p] > 0)
-                    sum += system.getMasses()[p] * v[p].dot(velocityRate[p]);
-            rate += factor * sum / value;
+            rate += factor / value * solver.sum(numParticles, [&](int p) {
+                return system.getMasses()[p] > 0 ? system.getMasses()[p] * v[p].dot(velocityRate[p]) : 0.0;
+            });
             break;
         case ArcLength:
-            for (int p = 0; p < numParticles; p++)
-                if (system.getMasses()[p] > 0)
-                    sum += v[p].dot(velocityRate[p]);
-            rate += factor * sum / value;
+            rate += factor / value * solver.sum(numParticles, [&](int p) {
+                return system.getMasses()[p] > 0 ? v[p].dot(velocityRate[p]) : 0.0;
+            });
             break;
         case MaxParticleArcLength: {
             const int fastest = findFastest(v);
@@ -230,7 +246,7 @@ double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vect
     auto givenMultiplier = [&](int k) { return multipliers[k] * system.toGivenMultiplier(k); };
     switch (term.kind) {
     case ConstraintMultipliers: // (4.4)
-        return std::sqrt(sumOf(numConstraints, [&](int k) { return givenMultiplier(k) * givenMultiplier(k); }));
+        return std::sqrt(multipliersSquared);
     case ConstraintForce:
         return std::sqrt(constraintForceSquared);
     case AppliedForce:
@@ -242,20 +258,18 @@ double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vect
     case ForcePNorm:
         return forcePNorms[index];
     case VectorField: // (4.1)
-        return std::sqrt(forceSquared +
-                         sumOf(numParticles, [&](int i) { return masses[i] > 0 ? masses[i] * v[i].dot(v[i]) : 0.0; }));
+        return std::sqrt(forceSquared + solver.sum(numParticles, [&](int i) {
+            return masses[i] > 0 ? masses[i] * v[i].dot(v[i]) : 0.0;
+        }));
     case MaxForce:
         return maxForce;
     case ArcLength:
         return std::sqrt(forceSquared +
-                         sumOf(numParticles, [&](int i) { return masses[i] > 0 ? v[i].dot(v[i]) : 0.0; }));
-    case MaxParticleArcLength: {
-        double largest = 0;
-        for (int i = 0; i < numParticles; i++)
-            if (masses[i] > 0)
-                largest = std::max(largest, v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]));
-        return std::sqrt(largest);
-    }
+                         solver.sum(numParticles, [&](int i) { return masses[i] > 0 ? v[i].dot(v[i]) : 0.0; }));
+    case MaxParticleArcLength:
+        return std::sqrt(solver.largest(numParticles, [&](int i) {
+            return masses[i] > 0 ? v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]) : 0.0;
+        }));
     case ForceGroupEnergy:
         return groupEnergy;
     }

@@ -7,6 +7,7 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include <cmath>
+#include <initializer_list>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -39,6 +40,20 @@ public:
         double weight, power;
         double reference; // U_k,ref; 0 while it is not known
         double order = 8; // p of the p-norms, of no meaning to others
+    };
+
+    /** What is at the multipliers Lambda of some velocities. */
+    struct Multipliers {
+        const std::vector<double>& multipliers; // Lambda(q,p)
+        const std::vector<double>& rightSide; // K Lambda = g''(v,v) + G M^-1 F
+        const std::vector<double>* rate; // the change of Lambda along a change of the velocities; or null
+    };
+    /** Sums over each range of constraints (ConstraintSolver::getNumRanges()), which are added in that order. */
+    struct Sums {
+        std::vector<double> forces,
+            forceRates; // of Lambda_k (K Lambda)_k, and of the rate of Lambda_k in place of Lambda_k
+        std::vector<double> multipliers,
+            multiplierRates; // of d_k^2 Lambda_k^2 and d_k^2 Lambda_k times its rate, in users' units
     };
 
     explicit StepMonitor(ConstraintSolver& solver);
@@ -88,29 +103,32 @@ public:
     void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
         forces = &newForces;
     }
+    Sums makeSums() const;
+    /** Make the sums of one range; threads may share the ranges. */
+    void sumRange(const Multipliers& at, int range, int first, int end, Sums& sums) const;
+    /** Make all of them. */
+    Sums sum(const Multipliers& at) const;
     /**
      * U_k at velocities v, for every term.
      *
      * @param v              the velocities (nm/ps)
      * @param multipliers    Lambda(q,p) at these velocities
-     * @param rightSide      K Lambda = g''(v,v) + G M^-1 F
+     * @param sums           those of these multipliers
      * @param values         U_k
      */
-    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
-                  const std::vector<double>& rightSide, std::vector<double>& values);
+    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers, const Sums& sums,
+                  std::vector<double>& values);
     /**
      * The derivative of u along a change of the velocities, at the state of the last evaluate().
      *
-     * @param v                 as in evaluate()
-     * @param multipliers       as in evaluate()
-     * @param rightSide         as in evaluate()
-     * @param values            what evaluate() gave
-     * @param velocityRate      the change of v
-     * @param multiplierRate    the change of Lambda that goes with it
+     * @param v               as in evaluate()
+     * @param at              the multipliers there, with their rate
+     * @param sums            those of them
+     * @param values          what evaluate() gave
+     * @param velocityRate    the change of v
      */
-    double evaluateRate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers,
-                        const std::vector<double>& rightSide, const std::vector<double>& values,
-                        const std::vector<OpenMM::Vec3>& velocityRate, const std::vector<double>& multiplierRate) const;
+    double evaluateRate(const std::vector<OpenMM::Vec3>& v, const Multipliers& at, const Sums& sums,
+                        const std::vector<double>& values, const std::vector<OpenMM::Vec3>& velocityRate) const;
     /**
      * Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls, or of forces that cancel
      * each other.
@@ -136,6 +154,8 @@ public:
                           std::vector<OpenMM::Vec3>& gradient);
 
 private:
+    bool isWanted(std::initializer_list<Kind> kinds) const;
+    template <class Size> double pNorm(int count, double order, const Size& size) const;
     double squareOf(const OpenMM::Vec3& force, int particle) const;
     bool areForcesNegligible(double acceleration) const;
     double evaluateTerm(size_t index, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers) const;
@@ -145,9 +165,10 @@ private:
     const ConstraintSystem& system;
     std::vector<Term> terms;
     const std::vector<OpenMM::Vec3>* forces;
-    double groupEnergy, appliedForceSquared, forceSquared, maxForce, constraintForceSquared;
+    double groupEnergy, appliedForceSquared, forceSquared, maxForce, constraintForceSquared, multipliersSquared;
     std::vector<double> forcePNorms; // of the terms of that kind
-    std::vector<double> blockSums;   // of the squares of the forces
+    // Of the blocks: the sums of the squares of the forces, the same over masses, and the largest square.
+    std::vector<double> blockSums, blockAppliedSums, blockLargest;
     std::vector<double> toSolve, solved;
 };
 

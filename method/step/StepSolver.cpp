@@ -34,12 +34,12 @@ double dot(const vector<double>& a, const vector<double>& b) {
 
 StepSolver::StepSolver(ConstraintSolver& constraints, const StepState& now) :
         constraints(constraints), now(now), h(0), tolerance(0), isMoving(false), isFromOnStep(false), lastDrift(0),
-        numNewtonIterations(0) {
+        offsetObserver(*this), numNewtonIterations(0) {
     const ConstraintSystem& system = constraints.getSystem();
     for (vector<Vec3>* vectors : {&next.q, &next.w, &next.v, &gradient, &halfStepChange})
         vectors->resize(system.getNumParticles());
-    for (vector<double>* numbers : {&multiplierOffset, &next.lambda, &next.rightSide, &lambdaNext, &multiplierTrial,
-                                    &rightSideTrial, &correction, &coupling, &response})
+    for (vector<double>* numbers : {&multiplierOffset, &offsetNext, &next.lambda, &next.rightSide, &lambdaNext,
+                                    &multiplierTrial, &rightSideTrial, &correction, &coupling, &response})
         numbers->resize(system.getNumConstraints());
     next.theta = thetaHalf = system.getGivenParameters();
     parameterChange.resize(next.theta.values.size());
@@ -120,6 +120,23 @@ void StepSolver::keepOffset() {
         multiplierOffset[k] = lambdaNext[k] - now.lambda[k];
 }
 
+ConstraintSolver::Observer* StepSolver::observeOffset(ConstraintSolver::Observer* observer) {
+    offsetObserver.other = observer;
+    return &offsetObserver;
+}
+
+void StepSolver::OffsetObserver::seeParticles(int block) {
+    other->seeParticles(block);
+}
+
+void StepSolver::OffsetObserver::seeConstraints(int range, int first, int end) {
+    const double *found = solver.lambdaNext.data(), *lambda = solver.now.lambda.data();
+    double* offset = solver.offsetNext.data();
+    for (int k = first; k < end; k++)
+        offset[k] = found[k] - lambda[k];
+    other->seeConstraints(range, first, end);
+}
+
 bool StepSolver::solve(DensityEquation& equation, double& rhoNext) {
     return solveByChord(equation, rhoNext) || solveByNewton(equation, rhoNext);
 }
@@ -138,11 +155,11 @@ bool StepSolver::solveByChord(DensityEquation& equation, double& rhoNext) {
     const double densityTolerance = std::max(REGULAR_MARGIN * tolerance, DENSITY_ROUNDING);
     for (int pass = 0; pass <= MAX_COUPLED_PASSES; pass++) {
         const ConstraintSolver::Trial trial = trialTo(0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext, now.w);
-        if (pass == 0)
-            constraints.beginCoupled(trial, regularGuess());
+        const ConstraintSolver::Guess start = regularGuess();
         const double constraintError =
-            constraints.coupledPass(trial, {parametersAtRateOf(trial.drift), multiplierTrial, rightSideTrial});
-        const double uPlus = equation.evaluate(next.w, multiplierTrial, rightSideTrial);
+            constraints.coupledPass(trial, {parametersAtRateOf(trial.drift), multiplierTrial, rightSideTrial},
+                                    pass == 0 ? &start : nullptr, equation.observe(multiplierTrial, rightSideTrial));
+        const double uPlus = equation.evaluate(next.w, multiplierTrial);
         const double mismatch = rhoNext - uPlus + equation.scale * (rho - equation.halfStepValue);
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
@@ -171,7 +188,9 @@ bool StepSolver::solveByNewton(DensityEquation& equation, double& rhoNext) {
             constraints.guess(trial, regularGuess());
         const double constraintError = constraints.evaluate(trial);
         constraints.findMultipliers(next.w, parametersAtRateOf(drift), multiplierTrial, rightSideTrial);
-        const double uPlus = equation.evaluate(next.w, multiplierTrial, rightSideTrial);
+        ConstraintSolver::Observer* observer = equation.observe(multiplierTrial, rightSideTrial);
+        constraints.forRanges([&](int range, int first, int end) { observer->seeConstraints(range, first, end); });
+        const double uPlus = equation.evaluate(next.w, multiplierTrial);
         // F_rho of docs/method.md, section 8
         const double mismatch = rhoNext - uPlus + equation.scale * rho - uMinus;
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);

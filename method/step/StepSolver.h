@@ -22,9 +22,11 @@ public:
     double halfStepValue;         // u(q,p-)
     double rate;                  // of u along F - G^T Lambda
     double fallBack;              // a rho+ to begin with where that of (3.15) is not positive
-    /** u(q,p+) at velocities w+, with Lambda(q,p+) and K times it. */
-    virtual double evaluate(const std::vector<OpenMM::Vec3>& w, const std::vector<double>& multipliers,
-                            const std::vector<double>& rightSide) = 0;
+    /** What is to see Lambda(q,p+) and K times it when they are known. */
+    virtual ConstraintSolver::Observer* observe(const std::vector<double>& multipliers,
+                                                const std::vector<double>& rightSide) = 0;
+    /** u(q,p+) at velocities w+, with Lambda(q,p+) that has been seen. */
+    virtual double evaluate(const std::vector<OpenMM::Vec3>& w, const std::vector<double>& multipliers) = 0;
     /** du/dw there. */
     virtual void findGradient(const std::vector<OpenMM::Vec3>& w, const ExpressionParameters& theta,
                               const std::vector<double>& multipliers, std::vector<OpenMM::Vec3>& gradient) = 0;
@@ -71,6 +73,11 @@ public:
     /** lambda[n] - Lambda[n], the error of the starting value of the iteration, is added to the next one. */
     void keepOffset();
     std::vector<double> multiplierOffset;
+    /** The same in two parts: an observer of the end of the step, which passes on what it sees, and when that has been accepted. */
+    ConstraintSolver::Observer* observeOffset(ConstraintSolver::Observer* observer);
+    void acceptOffset() {
+        multiplierOffset.swap(offsetNext);
+    }
     /** What is found: q[n+1], w[n+1/2] and theta[n+1]; the rest of this state is of the end of the step, which is not known here. */
     StepState next;
     long long getNumIterations() const {
@@ -78,6 +85,14 @@ public:
     }
 
 private:
+    struct OffsetObserver : ConstraintSolver::Observer {
+        explicit OffsetObserver(StepSolver& solver) : solver(solver) {
+        }
+        void seeParticles(int block) override;
+        void seeConstraints(int range, int first, int end) override;
+        StepSolver& solver;
+        ConstraintSolver::Observer* other = nullptr;
+    };
     ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
     ConstraintSolver::Guess regularGuess() const;
     bool solveByChord(DensityEquation& equation, double& rhoNext);
@@ -88,7 +103,8 @@ private:
     bool isMoving, isFromOnStep;
     double lastDrift; // of the last trial
     ExpressionParameters thetaHalf; // theta[n] with the rates of this step, at which (3.14) takes u(q[n],p[n+1/2])
-    std::vector<double> parameterChange, lambdaNext;
+    std::vector<double> parameterChange, lambdaNext, offsetNext;
+    OffsetObserver offsetObserver;
     std::vector<double> multiplierTrial, rightSideTrial, correction, coupling, response;
     std::vector<OpenMM::Vec3> gradient, halfStepChange;
     long long numNewtonIterations; // those of (3.14)

@@ -191,13 +191,21 @@ bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
     const Vec3 shift = velocities[movingParticles[0]] - now.v[movingParticles[0]];
     auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
     const double reference = sizeOf(shift) + sizeOf(now.v[movingParticles[0]]);
-    for (int i : movingParticles)
-        if (!(sizeOf(velocities[i] - now.v[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(now.v[i]))))
-            return false;
-    for (int i : movingParticles) {
-        now.v[i] = velocities[i];
-        now.w[i] += shift;
-    }
+    const int count = (int) movingParticles.size();
+    const double numOthers = constraints.largest(count, [&](int p) {
+        const int i = movingParticles[p];
+        const bool isShifted =
+            sizeOf(velocities[i] - now.v[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(now.v[i]));
+        return isShifted ? 0.0 : 1.0;
+    });
+    if (numOthers > 0)
+        return false;
+    constraints.share(count, [&](int first, int end) {
+        for (int p = first; p < end; p++) {
+            now.v[movingParticles[p]] = velocities[movingParticles[p]];
+            now.w[movingParticles[p]] += shift;
+        }
+    });
     control->change(StepControl::Frame, 0.0);
     return true;
 }
@@ -326,9 +334,10 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     StepState& next = solver.next;
     control->lookBack(forces, energy, stepKind, stepSize);
     const bool withHalfStep = control->needsHalfStep() && stepKind != StepControl::Shortened;
-    constraints.finish({next.q, next.w, forces, next.theta, 0.5 * stepSize, next.v, next.lambda, next.rightSide,
-                        withHalfStep ? &atHalfStep : nullptr}, // (3.12)-(3.13)
-                       control->observe(forces));
+    const ConstraintSolver::OnStep onStep = {next.q,      next.w,         forces,
+                                             next.theta,  0.5 * stepSize, next.v,
+                                             next.lambda, next.rightSide, withHalfStep ? &atHalfStep : nullptr};
+    constraints.finish(onStep, solver.observeOffset(control->observe(onStep))); // (3.12)-(3.13)
     const StepControl::End end = {next, forces, energy, withHalfStep ? &atHalfStep : nullptr, stepKind, stepSize};
     if (!control->measure(end))
         return false;
@@ -336,7 +345,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     constraints.endStep();
     control->accept(end);
     if (stepKind == StepControl::Regular)
-        solver.keepOffset();
+        solver.acceptOffset();
     next.force.swap(forces);
     next.groupEnergy = energy;
     std::swap(now, next);

@@ -40,6 +40,9 @@ public:
                     const std::vector<ExpressionConstraint>& expressions = {});
 
     void setParallel(const Parallel& parallel, int numThreads) override;
+    void share(int count, const std::function<void(int, int)>& task) override {
+        constraints.share(count, task);
+    }
 
     /**
      * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the

@@ -49,7 +49,7 @@ public:
     }
     double u(const vector<Vec3>& v) {
         solver.findMultipliers(v, theta, multipliers, rightSide);
-        monitor.evaluate(v, multipliers, rightSide, values);
+        monitor.evaluate(v, multipliers, monitor.sum({multipliers, rightSide, nullptr}), values);
         return monitor.combine(values);
     }
     // du along a change of v, with the change of Lambda that goes with it: 2 K^-1 G(v) dv
@@ -63,7 +63,8 @@ public:
         for (double& x : multiplierRate)
             x *= 2;
         solver.solveMatrix(multiplierRate);
-        return monitor.evaluateRate(v, multipliers, rightSide, values, change, multiplierRate);
+        const StepMonitor::Multipliers at = {multipliers, rightSide, &multiplierRate};
+        return monitor.evaluateRate(v, at, monitor.sum(at), values, change);
     }
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);

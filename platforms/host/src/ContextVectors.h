@@ -21,6 +21,13 @@ public:
     virtual Vectors& getForces() = 0;
     virtual void setPositions(const Vectors& positions) = 0;
     virtual void setVelocities(const Vectors& velocities) = 0;
+    /** Where positions and velocities may be written in place, or null if they are elsewhere. */
+    virtual Vectors* accessPositions() {
+        return nullptr;
+    }
+    virtual Vectors* accessVelocities() {
+        return nullptr;
+    }
     /** The three periodic box vectors. */
     virtual const OpenMM::Vec3* getBoxVectors() = 0;
     virtual double getTime() = 0;

@@ -10,6 +10,7 @@
 #include "run/RunState.h"
 #include "run/StartCheck.h"
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <limits>
 
@@ -257,36 +258,45 @@ const vector<Vec3>& HostRunDevice::knownVelocities() const {
 
 // Particles of mass zero are not the integrator's to move: they are virtual sites, or fixed.
 bool HostRunDevice::differ(const Vectors& a, const Vectors& b) const {
-    for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] > 0 && a[i] != b[i])
-            return true;
-    return false;
+    std::atomic<bool> areSame(true);
+    dynamics->share((int) masses.size(), [&](int first, int end) {
+        for (int i = first; i < end && areSame; i++)
+            if (masses[i] > 0 && a[i] != b[i])
+                areSame = false;
+    });
+    return !areSame;
 }
 
 void HostRunDevice::writeMovingPositions(const Vectors& positions) {
-    if (!hasMassless) {
+    if (Vectors* storage = vectors->accessPositions())
+        copyMoving(positions, *storage);
+    else if (!hasMassless)
         vectors->setPositions(positions);
-        return;
+    else {
+        Vectors all = vectors->getPositions();
+        copyMoving(positions, all);
+        vectors->setPositions(all);
     }
-    Vectors all = vectors->getPositions();
-    copyMoving(positions, all);
-    vectors->setPositions(all);
 }
 
 void HostRunDevice::writeMovingVelocities(const Vectors& velocities) {
-    if (!hasMassless) {
+    if (Vectors* storage = vectors->accessVelocities())
+        copyMoving(velocities, *storage);
+    else if (!hasMassless)
         vectors->setVelocities(velocities);
-        return;
+    else {
+        Vectors all = vectors->getVelocities();
+        copyMoving(velocities, all);
+        vectors->setVelocities(all);
     }
-    Vectors all = vectors->getVelocities();
-    copyMoving(velocities, all);
-    vectors->setVelocities(all);
 }
 
 void HostRunDevice::copyMoving(const Vectors& from, Vectors& to) const {
-    for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] > 0)
-            to[i] = from[i];
+    dynamics->share((int) masses.size(), [&](int first, int end) {
+        for (int i = first; i < end; i++)
+            if (masses[i] > 0)
+                to[i] = from[i];
+    });
 }
 
 // ----------------------------------------------------------------------------------------------------------- the steps

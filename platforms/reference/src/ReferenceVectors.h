@@ -29,6 +29,12 @@ public:
     void setVelocities(const Vectors& velocities) override {
         *data.velocities = velocities;
     }
+    Vectors* accessPositions() override {
+        return data.positions;
+    }
+    Vectors* accessVelocities() override {
+        return data.velocities;
+    }
     const OpenMM::Vec3* getBoxVectors() override {
         return data.periodicBoxVectors;
     }
