@@ -170,7 +170,7 @@ EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
 }
 
 EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, int numOuter) {
-    const int SLACK = 2, FEW = 5;
+    const size_t FEW = 5;
     vector<vector<int>> neighbours(size + numOuter); // of what is left, sorted
     for (const auto& entry : entries) {
         neighbours[entry.first].push_back(entry.second);
@@ -191,7 +191,7 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, i
             degree(*std::min_element(left.begin(), left.end(), [&](int a, int b) { return degree(a) < degree(b); }));
         if (least >= (size_t) EliminationOrder::WIDE)
             break;
-        const size_t most = std::max(std::min(least + SLACK, (size_t) FEW), least);
+        const size_t most = std::max(least, FEW);
         candidates.clear();
         std::copy_if(left.begin(), left.end(), std::back_inserter(candidates),
                      [&](int row) { return degree(row) <= most; });

@@ -59,8 +59,8 @@ EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries);
 
 /**
  * Find an order of few levels, for a processor that does much at once. In rounds, a set of rows is eliminated of which no two are
- * coupled, each with nearly the fewest couplings or at most five: a chain halves each round, and a molecule of 10,000 bonds is gone
- * after 14. The fill is somewhat larger. What has become dense is left to the order of least fill. Places are sorted by levels.
+ * coupled, each with at most five couplings or with the fewest: a chain halves each round, and one of 10,000 bonds is gone after 14.
+ * The fill is somewhat larger. What has become dense is left to the order of least fill. Places are sorted by levels.
  *
  * @param size        the number of rows that are eliminated
  * @param entries     the entries of the matrix, outer rows included

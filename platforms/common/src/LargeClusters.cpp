@@ -49,6 +49,8 @@ enum Header {
 
 const int LARGEST_INDEX = 65535, LARGEST_TABLE = 1 << 18; // bytes
 const int MANY_JOINTS = 1024;
+// As in kernels/large.cc.
+const int SPLIT = 8;
 // A cluster of so many pieces is left whole, unless it does not fit into local memory.
 const double WHOLE = 2.5;
 
@@ -524,8 +526,9 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         const size_t numValues =
             (size_t) elimination.getFirstOuterSlot() + elimination.outer.size() + (size_t) numBorders * numPieceJoints;
         layout.numKept = roundUp(numValues + 8, 4);
-        layout.factorSize =
-            roundUp((size_t) layout.numKept + 4 * numRows + 2 * numPieceJoints + numJointEntries + 8, 4);
+        layout.factorSize = roundUp((size_t) layout.numKept + 4 * numRows + numParticles + SPLIT * numBorders +
+                                        2 * numPieceJoints + numJointEntries + 8,
+                                    4);
         layout.workSize = roundUp((size_t) 5 * numInner + numRows + 7 * numParticles + 7 * numPieceJoints, 4);
         numLevels = std::max(numLevels, elimination.numLevels);
         numEntries = std::max(numEntries, (size_t) elimination.getNumEntries());

@@ -48,6 +48,8 @@
 // 16-byte words of the tables and numbers of the factor that a thread loads while it waits for others.
 #define AHEAD 8
 #define KEPT_AHEAD 6
+// Threads that add up what the joints do to a border.
+#define SPLIT 8
 
 #define IS_OWN(row) ((row).z >= 0)
 #define NUMBER_OF(row) ((row).z & 0x7fffffff)
@@ -158,10 +160,15 @@ inline DEVICE void runLevels(const int pass, int numLevels, int numWide, MEMORY 
 /** The same for several right-hand sides. */
 inline DEVICE void runForAll(const int pass, int numLevels, MEMORY const int* starts, MEMORY const uint4* records, MEMORY const index_t* more,
         MEMORY real* A, MEMORY real* X, int count, int stride) {
+    // A power of two of neighbouring threads has one record.
+    int shift = 0;
+    KEEP_LOOP while ((1 << shift) < count && (2 << shift) <= NUM_THREADS)
+        shift++;
     KEEP_LOOP for (int level = 0; level < numLevels; level++) {
-        const int begin = starts[level], number = (starts[level+1] - begin)*count;
-        KEEP_LOOP for (int i = THREAD; i < number; i += NUM_THREADS)
-            applyRecord(pass, records[begin + i/count], more, A, X + (i%count)*stride);
+        const int end = starts[level+1];
+        KEEP_LOOP for (int i = starts[level] + (THREAD >> shift); i < end; i += NUM_THREADS >> shift)
+            KEEP_LOOP for (int k = THREAD & ((1 << shift) - 1); k < count; k += 1 << shift)
+                applyRecord(pass, records[i], more, A, X + k*stride);
         SYNC_PIECE;
     }
 }
@@ -350,9 +357,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     MEMORY mixed* jointPulls = jointConstants + numJoints;
     MEMORY mixed* jointRight = jointPulls + numJoints;
     MEMORY mixed* jointSums = jointRight + numJoints;
-#if HALF_SUMS
-    MEMORY mixed* before = jointSums + numJoints;
-#endif
+    MEMORY mixed* before = jointSums + numJoints; // velocities before the kick, or positions before the step
+    MEMORY real* charges = jointWeights + numJoints;
 
     // ---------------------------------------------------------------------------------------- the state at the beginning
     bool isRegular = true; // no constraints that depend on each other, no force that is no number
@@ -417,6 +423,9 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             mixed p[3];
             const real charge = loadPosition(posq, posqCorrection, atom, p);
             oldPositions[atom] = make_mixed4(p[0], p[1], p[2], charge);
+            charges[i] = charge;
+            UNROLL for (int d = 0; d < 3; d++)
+                before[3*i+d] = p[d];
             oldVelocities[atom] = make_mixed4(v[0], v[1], v[2], W[i]);
         }
         UNROLL for (int d = 0; d < 3; d++) {
@@ -480,7 +489,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     const int numJointLevels = header[13], numJointEntries = header[14], numBorderEntries = header[15], firstContribution = header[16];
     const int firstBorderEntry = header[17];
     MEMORY real* Z = A + firstBorderEntry + numBorderEntries; // this piece's rows of the inverse of the joints' matrix
-    MEMORY real* J = jointWeights + numJoints; // the joints' matrix
+    MEMORY real* partSums = charges + numAtoms;
+    MEMORY real* J = partSums + SPLIT*numBorders; // the joints' matrix
 #endif
 
     // K; its diagonal is there
@@ -535,41 +545,54 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             if (!isConverged || !(fabs(right) <= task.tolerance*dot3(r, r)))
                 flags[now^1] = 1;
         }
+        SYNC_PIECE;
         // The joints' matrix, at first.
-        const int isFresh = (mode == FINISH && stage == 1 && numJoints > 0 ? 1 : 0);
-        GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
-        KEEP_LOOP for (int i = THREAD; i < isFresh*(numJoints + numJointEntries); i += NUM_THREADS) {
-            mixed sum = 0;
-            // Two at once: a constraint has two ends.
-            const int end = sourceStart[i+1];
-            KEEP_LOOP for (int at = sourceStart[i]; at < end; at += 2) {
-                const bool isPair = (at + 1 < end);
-                mixed values[2];
-                receiveValues(2, contributions + WORDS_PER_VALUE*sources[at], WORDS_PER_VALUE*((int) sources[isPair ? at + 1 : at] - (int) sources[at]),
-                        1, task.stamp, values);
-                sum += values[0] + (isPair ? values[1] : (mixed) 0);
+        if (mode == FINISH && stage == 1 && numJoints > 0) {
+            GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
+            KEEP_LOOP for (int i = THREAD; i < numJoints + numJointEntries; i += NUM_THREADS) {
+                mixed sum = 0;
+                // Two at once: a constraint has two ends.
+                const int end = sourceStart[i+1];
+                KEEP_LOOP for (int at = sourceStart[i]; at < end; at += 2) {
+                    const bool isPair = (at + 1 < end);
+                    mixed values[2];
+                    receiveValues(2, contributions + WORDS_PER_VALUE*sources[at], WORDS_PER_VALUE*((int) sources[isPair ? at + 1 : at] - (int) sources[at]),
+                            1, task.stamp, values);
+                    sum += values[0] + (isPair ? values[1] : (mixed) 0);
+                }
+                J[i] = (real) sum;
             }
-            J[i] = (real) sum;
+            KEEP_LOOP for (int i = THREAD; i < numBorders*numJoints; i += NUM_THREADS)
+                Z[i] = 0;
+            SYNC_PIECE;
+            KEEP_LOOP for (int b = THREAD; b < numBorders; b += NUM_THREADS)
+                Z[b*numJoints + (borders[b] >> 1)] = 1;
+            runLevels(FACTORIZE, numJointLevels, numJointLevels, jointStarts, tables, jointMore, J, J);
+            isRegular = scaleFactor(numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, J, jointWeights) && isRegular;
+            SYNC_PIECE;
+            runForAll(FORWARD, numJointLevels, jointStarts + numJointLevels + 2, tables, jointMore, J, Z, numBorders, numJoints);
+            runForAll(BACKWARD, numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, jointMore, J, Z, numBorders, numJoints);
         }
-        KEEP_LOOP for (int i = THREAD; i < isFresh*numBorders*numJoints; i += NUM_THREADS)
-            Z[i] = ((borders[i/numJoints] >> 1) == i%numJoints ? 1 : 0);
-        SYNC_PIECE;
-        runLevels(FACTORIZE, isFresh*numJointLevels, numJointLevels, jointStarts, tables, jointMore, J, J);
-        isRegular = scaleFactor(isFresh*numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, J, jointWeights) && isRegular;
-        SYNC_PIECE;
-        runForAll(FORWARD, isFresh*numJointLevels, jointStarts + numJointLevels + 2, tables, jointMore, J, Z, numBorders, numJoints);
-        runForAll(BACKWARD, isFresh*numJointLevels, jointStarts + 2*(numJointLevels + 2), tables, jointMore, J, Z, numBorders, numJoints);
 #else
         SYNC_PIECE;
 #endif
         const bool isConverged = (phase == POSITIONS && stage > 1 && flags[now^1] == 0);
         const bool isSolved = (isUnderWay && !isConverged);
 #if HAS_JOINTS
+        // For each border by a few threads.
+        KEEP_LOOP for (int i = THREAD; i < (isSolved ? SPLIT*numBorders : 0); i += NUM_THREADS) {
+            const int b = i/SPLIT;
+            real sum = 0;
+            for (int j = i%SPLIT; j < numJoints; j += SPLIT)
+                sum += Z[b*numJoints+j]*(real) jointSums[j];
+            partSums[i] = sum;
+        }
+        SYNC_PIECE;
         KEEP_LOOP for (int b = THREAD; b < (isSolved ? numBorders : 0); b += NUM_THREADS) {
-            mixed sum = 0;
-            KEEP_LOOP for (int j = 0; j < numJoints; j++)
-                sum += Z[b*numJoints+j]*jointSums[j];
-            x[numInner+b] = (real) sum;
+            real sum = 0;
+            UNROLL for (int i = 0; i < SPLIT; i++)
+                sum += partSums[SPLIT*b+i];
+            x[numInner+b] = sum;
         }
         SYNC_PIECE;
 #endif
@@ -608,7 +631,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         const bool isMoved = (phase == VELOCITIES ? isUnderWay : phase == POSITIONS && !isConverged);
         KEEP_LOOP for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
             real push[3] = {0, 0, 0};
-            const int begin = incidenceStart[i], end = incidenceStart[i+1];
+            const int begin = incidenceStart[i], end = (isMoved || isMeasured ? incidenceStart[i+1] : begin);
             // Four at once, which are mostly all.
             KEEP_LOOP for (int at = begin; at < end; at += 4)
                 UNROLL for (int j = 0; j < 4; j++) {
@@ -639,9 +662,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                 velm[pieceAtoms[firstAtom+i]] = make_mixed4(v[0], v[1], v[2], w);
             if (mode == ADVANCE && isConverged && task.dt > 0) {
                 const int atom = pieceAtoms[firstAtom+i];
-                mixed p[3];
-                const real charge = loadPosition(posq, posqCorrection, atom, p);
-                storePosition(posq, posqCorrection, atom, p[0] + v[0], p[1] + v[1], p[2] + v[2], charge);
+                storePosition(posq, posqCorrection, atom, before[3*i] + v[0], before[3*i+1] + v[1], before[3*i+2] + v[2], charges[i]);
                 const mixed inverse = 1/task.dt;
                 velm[atom] = make_mixed4(v[0]*inverse, v[1]*inverse, v[2]*inverse, w);
             }
