@@ -154,9 +154,11 @@ class Problem:
         self.topology = modeller.topology
         self.system = create_system(modeller.topology)
         self.platform = openmm.Platform.getPlatformByName(platform)
+        # Single precision drifts by itself at constant energy.
+        self.properties = {"Precision": "mixed"} if "Precision" in self.platform.getPropertyNames() else {}
         integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 5.0, 0.002)
         integrator.setRandomNumberSeed(1)
-        context = openmm.Context(self.system, integrator, self.platform)
+        context = openmm.Context(self.system, integrator, self.platform, self.properties)
         context.setPositions(modeller.positions)
         openmm.LocalEnergyMinimizer.minimize(context, 10.0, 200)
         context.setVelocitiesToTemperature(TEMPERATURE, 2)
@@ -177,7 +179,7 @@ class Problem:
 
     def context(self, integrator: openmm.Integrator) -> openmm.Context:
         """A Context at the start."""
-        context = openmm.Context(self.system, integrator, self.platform)
+        context = openmm.Context(self.system, integrator, self.platform, self.properties)
         context.setPeriodicBoxVectors(*self.start.getPeriodicBoxVectors())
         context.setPositions(self.start.getPositions())
         context.setVelocities(self.start.getVelocities())
@@ -339,7 +341,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pages.provenance(problem.device),
         "",
         f"{problem.name}: {problem.atoms:,} atoms, {problem.system.getNumConstraints():,} constraints, platform "
-        f"{options.platform}, nominal step {options.step:g} fs.",
+        f"{options.platform}{', mixed precision' if problem.properties else ''}, nominal step {options.step:g} fs.",
         "",
         *table(summaries),
     ]
