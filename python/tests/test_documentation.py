@@ -195,6 +195,13 @@ def test_the_recipe_is_the_same_everywhere(name: str) -> None:
     assert recipe in first
 
 
+@pytest.mark.parametrize("name", ["quick_start.py", "swap_verlet.py", "nve_water.py", "quick_tour.ipynb"])
+def test_an_example_to_begin_with_has_the_recipe(name: str) -> None:
+    text = (ROOT / "examples" / name).read_text(encoding="utf-8")
+    first = re.search(r"integrator = VariableStepRattleIntegrator\(.*", text)[0]
+    assert re.match(r"integrator = VariableStepRattleIntegrator\(0\.\d+, automatic=True\)  #", first)
+
+
 @pytest.mark.parametrize("picture", sorted(ROOT.glob("docs/images/*.png")), ids=name_of)
 def test_a_picture_is_small_and_shown(picture: Path) -> None:
     assert picture.stat().st_size < 200_000
