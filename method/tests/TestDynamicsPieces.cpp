@@ -111,6 +111,43 @@ void testCut() {
     ASSERT(cutCluster(chain, 500).pieces.empty());
 }
 
+// Along a tree: pieces hang together, are mostly not much larger than asked for, and have about one joint each.
+void testCutAlongTree() {
+    const int backbone = 600, arm = 3;
+    vector<vector<int>> comb;
+    for (int i = 0; i < backbone; i++) {
+        const int first = i * (arm + 1);
+        if (i > 0)
+            comb.push_back({first - arm - 1, first});
+        for (int k = 0; k < arm; k++)
+            comb.push_back({first + k, first + k + 1});
+    }
+    const ClusterCut cut = cutClusterAlongTree(comb, 64);
+    ASSERT(cut.pieces.size() >= 30 && cut.pieces.size() <= comb.size() / 64 + 1);
+    ASSERT_EQUAL(cut.pieces.size() - 1, cut.joints.size()); // there is no ring
+    std::set<int> constraints(cut.joints.begin(), cut.joints.end()), particles;
+    size_t numConstraints = cut.joints.size();
+    for (const ClusterCut::Piece& piece : cut.pieces) {
+        const std::set<int> own(piece.particles.begin(), piece.particles.end());
+        ASSERT_EQUAL(own.size() - 1, piece.constraints.size()); // it hangs together
+        ASSERT(own.size() >= 32 && own.size() <= 64 + 64);
+        for (int k : piece.constraints)
+            ASSERT(own.count(comb[k][0]) == 1 && own.count(comb[k][1]) == 1);
+        constraints.insert(piece.constraints.begin(), piece.constraints.end());
+        particles.insert(own.begin(), own.end());
+        numConstraints += piece.constraints.size();
+    }
+    ASSERT_EQUAL(comb.size(), numConstraints);
+    ASSERT_EQUAL(comb.size(), constraints.size());
+    ASSERT_EQUAL((size_t) backbone * (arm + 1), particles.size());
+    // The ring gets one joint more, and what is smaller than a piece is one.
+    comb.push_back({0, (backbone - 1) * (arm + 1)});
+    const ClusterCut ring = cutClusterAlongTree(comb, 64);
+    ASSERT(ring.joints.size() >= ring.pieces.size() - 1 && ring.joints.size() <= ring.pieces.size());
+    comb.resize(40);
+    ASSERT_EQUAL(1, (int) cutClusterAlongTree(comb, 64).pieces.size());
+}
+
 void testMatrix(const Example& e) {
     ConstraintSystem system(e.masses, e.distances, e.expressions);
     const ExpressionParameters theta = system.getGivenParameters();
@@ -256,6 +293,7 @@ int main() {
     const Example comb = makeComb(15500), rod = makeRod(3600);
     return runTests({
         {"the cut", testCut},
+        {"the cut along a tree", testCutAlongTree},
         {"K and its factor, a comb", [&] { testMatrix(comb); }},
         {"K and its factor, a rod", [&] { testMatrix(rod); }},
         {"Newton's matrix, a comb", [&] { testNewtonMatrix(comb); }},

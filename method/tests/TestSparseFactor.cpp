@@ -158,6 +158,28 @@ void testRounds(int size, const MatrixEntries& entries, int maxLevels, double ma
     ASSERT((double) (entriesOfFactor + size) <= maxFill * (double) (entries.size() + size));
 }
 
+// The same with rows that stay: they are in no level, and what is eliminated beside them gives the same levels by definition.
+void testOuterRounds(int size, int numOuter, const MatrixEntries& given) {
+    MatrixEntries entries = given;
+    for (int row = 0; row < numOuter; row++)
+        for (int k = 0; k < 3; k++)
+            entries.emplace_back(size + row, (int) (dice.generator() % size));
+    const EliminationOrder order = findEliminationRounds(size, entries, numOuter);
+    ASSERT_EQUAL(size, (int) order.rows.size());
+    vector<int> sorted = order.rows, all = order.rows;
+    std::sort(sorted.begin(), sorted.end());
+    for (int i = 0; i < size; i++)
+        ASSERT_EQUAL(i, sorted[i]);
+    for (int row = size; row < size + numOuter; row++)
+        all.push_back(row);
+    const EliminationTree tree = findEliminationTree(size + numOuter, reorder(entries, all));
+    for (int column = 0; column < size; column++) {
+        const int parent = tree.parent[column];
+        ASSERT(parent == EliminationTree::NONE || parent >= size || order.levels[parent] > order.levels[column]);
+    }
+    ASSERT(std::is_sorted(order.levels.begin(), order.levels.end()));
+}
+
 // The couplings of the bonds of a comb: a molecule with side groups and rings of three.
 MatrixEntries makeMolecule(int backbone, int& size) {
     const Example e = makeComb(backbone);
@@ -284,6 +306,8 @@ int main() {
              testRounds(size, entries, 20, 1.5);
          }},
         {"rounds, a dense matrix", [] { testRounds(60, makeDense(60), 60, 1.0); }},
+        {"rounds beside outer rows, a chain", [] { testOuterRounds(300, 5, makeChain(300)); }},
+        {"rounds beside outer rows, a cube", [] { testOuterRounds(512, 40, makeCube(8)); }},
         {"rounds, a cube", [] { testRounds(1000, makeCube(10), 400, 100); }},
         {"factor, a chain", [] { testFactor(300, makeChain(300)); }},
         {"factor, a dense matrix", [] { testFactor(150, makeDense(150)); }},
