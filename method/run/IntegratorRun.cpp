@@ -207,9 +207,11 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
             toldDensity = density;
         }
         throwFailure(settings, "the step", device.getTime(), failure.what(),
-                     settings.langevin ? "; the Context is in the state before this step"
-                                       : "; the Context is in the state before this step: use a smaller step size, or "
-                                         "another monitor");
+                     settings.langevin
+                         ? "; the Context is in the state before this step: move apart what overlaps, or allow more "
+                           "substeps with setMaximumSubsteps()"
+                         : "; the Context is in the state before this step: use a smaller step size, or "
+                           "another monitor");
     }
 }
 

@@ -7,7 +7,6 @@
 #include "step/RandomNumbers.h"
 #include <algorithm>
 #include <cmath>
-#include <functional>
 #include <limits>
 #include <sstream>
 #include <string>
@@ -33,29 +32,16 @@ const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
 const double MARGIN = 0.1;
 const int NO_LIMIT = std::numeric_limits<int>::max();
 
-// Particles are shared by threads from this number on. A call of the thread pool costs 6 us.
-const int MIN_PARALLEL_PARTICLES = 4000;
-
 bool isFinite(const Vec3& x) {
     return std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]);
-}
-
-// The first of the particles whose vector is no number, or -1.
-int findNotFinite(const vector<Vec3>& x, const vector<int>& particles) {
-    Vec3 sum; // of zeros, or a NaN: this is faster than to look at each number
-    for (int i : particles)
-        sum += x[i] - x[i];
-    if (isFinite(sum))
-        return -1;
-    return *std::find_if(particles.begin(), particles.end(), [&](int i) { return !isFinite(x[i]); });
 }
 
 } // namespace
 
 LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                    const vector<ExpressionConstraint>& expressions) :
-        solver(masses, constraints, expressions), numThreads(1), clusterForces(solver), groupEnergy(0), values(1, 0.0),
-        reference(0), lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1), isInProgress(false),
+        solver(masses, constraints, expressions), clusterForces(solver), groupEnergy(0), values(1, 0.0), reference(0),
+        lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1), isInProgress(false),
         isAtStart(false), doublings(0), substep(0), systemSize(0) {
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
@@ -69,22 +55,8 @@ LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<Di
     systemSize = ClusterForces::eighthRootOfFourthPowers(clusterSums);
 }
 
-void LangevinDynamics::setParallel(const Parallel& newParallel, int newNumThreads) {
-    solver.setParallel(newParallel, newNumThreads);
-    const bool isLarge = (int) solver.getMovingParticles().size() >= MIN_PARALLEL_PARTICLES;
-    numThreads = isLarge ? newNumThreads : 1;
-    parallel = newParallel;
-}
-
-// Call task(first, end) for parts of the list of particles with mass. What it does with one must not depend on others.
-template <class Task> void LangevinDynamics::forParticles(const Task& task) {
-    const size_t count = solver.getMovingParticles().size();
-    if (numThreads < 2) {
-        task((size_t) 0, count);
-        return;
-    }
-    auto runShare = [&](int thread) { task(count * thread / numThreads, count * (thread + 1) / numThreads); };
-    parallel(std::ref(runShare));
+void LangevinDynamics::setParallel(const Parallel& parallel, int numThreads) {
+    solver.setParallel(parallel, numThreads);
 }
 
 void LangevinDynamics::setSettings(const Settings& newSettings) {
@@ -151,8 +123,8 @@ double LangevinDynamics::evaluateMonitor(const Vectors& positions, const Express
     const Vectors& netForces = clusterForces.findNetForces(positions, parameters, forces, multipliers);
     const vector<int>& particles = solver.getMovingParticles();
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
-    forParticles([&](size_t first, size_t end) {
-        for (size_t p = first; p < end; p++) {
+    solver.share((int) particles.size(), [&](int first, int end) {
+        for (int p = first; p < end; p++) {
             const int i = particles[p];
             const double square = netForces[i].dot(netForces[i]), speedSquared = velocities[i].dot(velocities[i]);
             particleShares[p] = square * inverseMasses[i] + std::sqrt(square) * speedSquared * (1 / FLIGHT_LENGTH);
@@ -162,6 +134,18 @@ double LangevinDynamics::evaluateMonitor(const Vectors& positions, const Express
     for (size_t p = 0; p < particles.size(); p++)
         clusterSums[clusterForces.getClusters()[p]] += particleShares[p];
     return ClusterForces::eighthRootOfFourthPowers(clusterSums);
+}
+
+// The first of the particles with mass whose vector is no number, or -1.
+int LangevinDynamics::findNotFinite(const Vectors& x) {
+    const vector<int>& particles = solver.getMovingParticles();
+    const double sum = solver.sum((int) particles.size(), [&](int p) { // of zeros, or a NaN
+        const Vec3& each = x[particles[p]];
+        return (each[0] - each[0]) + (each[1] - each[1]) + (each[2] - each[2]);
+    });
+    if (sum == 0)
+        return -1;
+    return *std::find_if(particles.begin(), particles.end(), [&](int i) { return !isFinite(x[i]); });
 }
 
 // ------------------------------------------------------------------------------------------------- between two steps
@@ -216,7 +200,7 @@ void LangevinDynamics::settle() {
 
 // P v, Lambda and U at q.
 void LangevinDynamics::evaluateOnStep() {
-    const int lost = findNotFinite(force, solver.getMovingParticles());
+    const int lost = findNotFinite(force);
     if (lost >= 0)
         throw StepFailure("the force on particle " + std::to_string(lost) + " is infinite or not a number");
     wNext = v;
@@ -318,8 +302,8 @@ void LangevinDynamics::addNoise(Vectors& velocities) {
     const vector<int>& particles = solver.getMovingParticles();
     if (damping == 0)
         return;
-    forParticles([&](size_t first, size_t end) {
-        for (size_t p = first; p < end; p++) {
+    solver.share((int) particles.size(), [&](int first, int end) {
+        for (int p = first; p < end; p++) {
             const int i = particles[p];
             velocities[i] *= a;
             if (s > 0)
@@ -414,7 +398,7 @@ bool LangevinDynamics::tryDrift(const ConstraintSolver::Trial& trial, const vect
         reason = failure.what();
         return false;
     }
-    const int lost = findNotFinite(trial.positions, solver.getMovingParticles());
+    const int lost = findNotFinite(trial.positions);
     if (lost >= 0)
         reason = "the position of particle " + std::to_string(lost) + " became infinite or not a number";
     return lost < 0;
@@ -423,7 +407,7 @@ bool LangevinDynamics::tryDrift(const ConstraintSolver::Trial& trial, const vect
 bool LangevinDynamics::finish(Vectors& forces, double energy) {
     const int substeps = LangevinSettings::getSubsteps(doublings);
     isAtStart = false;
-    const int lost = findNotFinite(forces, solver.getMovingParticles());
+    const int lost = findNotFinite(forces);
     if (lost >= 0) {
         raise("the force on particle " + std::to_string(lost) + " became infinite or not a number");
         return false;

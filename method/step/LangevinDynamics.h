@@ -163,7 +163,7 @@ private:
     void evaluateOnStep();
     void settle();
     void addNoise(Vectors& velocities);
-    template <class Task> void forParticles(const Task& task);
+    int findNotFinite(const Vectors& x);
     void startAttempt();
     void raise(const std::string& reason);
     bool trySubstep(std::string& reason);
@@ -174,8 +174,6 @@ private:
     }
 
     ConstraintSolver solver;
-    Parallel parallel; // empty: one thread
-    int numThreads;
     ClusterForces clusterForces;
     Settings settings;
 
