@@ -48,7 +48,7 @@ enum Header {
 };
 
 const int LARGEST_INDEX = 65535, LARGEST_TABLE = 1 << 18; // bytes
-const int MANY_JOINTS = 1024;
+const int MANY_JOINTS = 1024, SMALLEST_PIECE = 24;
 // As in kernels/large.cc.
 const int SPLIT = 8;
 // A cluster of so many pieces is left whole, unless it does not fit into local memory.
@@ -279,24 +279,12 @@ LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& lim
     int pieceSize = limits.pieceSize;
     if (limits.numResident > 0)
         pieceSize = std::max(pieceSize, (int) (1.1 * (double) total / limits.numResident));
-    clear();
-    form.areRecords = true;
-    bool areRecords = true;
-    for (const ClusterKind& kind : kinds)
-        areRecords = areRecords && addKind(kind, limits, pieceSize);
-    if (!areRecords) {
-        clear();
-        form.areRecords = false;
-        for (const ClusterKind& kind : kinds)
-            addKind(kind, limits, 0);
-    }
-    form.hasJoints = numJoints > 0;
-    const auto isJoined = [](const Piece& piece) { return piece.numJoints > 0; };
-    form.isStaged =
-        form.hasJoints && std::count_if(pieces.begin(), pieces.end(), isJoined) > std::max(limits.numResident, 0);
-    form.isInLocalMemory = form.areRecords && !form.isStaged && 16 * localSize <= limits.localMemory;
-    form.isFused = !pieces.empty() && form.isInLocalMemory && limits.numResident > 0 &&
-                   2 * (int) pieces.size() <= limits.numGroups;
+    build(kinds, limits, pieceSize);
+    // Smaller pieces may fit into local memory.
+    for (int smaller = pieceSize * 3 / 4; isTooLarge() && smaller >= SMALLEST_PIECE; smaller = smaller * 3 / 4)
+        build(kinds, limits, smaller);
+    if (isTooLarge() || form.isStaged)
+        build(kinds, limits, pieceSize);
     if (form.isInLocalMemory) {
         numFactors = numWork = 0;
         for (Piece& piece : pieces) {
@@ -307,6 +295,31 @@ LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& lim
     }
     // What is loaded in advance of need may lie behind the end.
     tables.resize(tables.size() + 4 * (size_t) (limits.numThreads + 1), 0);
+}
+
+// Whether it is in global memory for want of room alone.
+bool LargeClusters::isTooLarge() const {
+    return form.areRecords && !form.isStaged && !form.isInLocalMemory;
+}
+
+void LargeClusters::build(const vector<ClusterKind>& kinds, const Limits& limits, int pieceSize) {
+    clear();
+    form.areRecords = true;
+    bool areRecords = true;
+    for (const ClusterKind& kind : kinds)
+        areRecords = areRecords && addKind(kind, limits, pieceSize);
+    if (!areRecords) {
+        clear();
+        for (const ClusterKind& kind : kinds)
+            addKind(kind, limits, 0);
+    }
+    form.hasJoints = numJoints > 0;
+    const auto isJoined = [](const Piece& piece) { return piece.numJoints > 0; };
+    form.isStaged =
+        form.hasJoints && std::count_if(pieces.begin(), pieces.end(), isJoined) > std::max(limits.numResident, 0);
+    form.isInLocalMemory = form.areRecords && !form.isStaged && 16 * localSize <= limits.localMemory;
+    form.isFused = !pieces.empty() && form.isInLocalMemory && limits.numResident > 0 &&
+                   2 * (int) pieces.size() <= limits.numGroups;
 }
 
 void LargeClusters::clear() {

@@ -120,6 +120,8 @@ private:
     struct Layout;
     struct Elimination;
     bool addKind(const ClusterKind& kind, const Limits& limits, int pieceSize);
+    void build(const std::vector<ClusterKind>& kinds, const Limits& limits, int pieceSize);
+    bool isTooLarge() const;
     void clear();
     Form form;
     std::vector<Piece> pieces;

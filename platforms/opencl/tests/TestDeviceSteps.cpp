@@ -375,7 +375,14 @@ void testDivision() {
     limits.numResident = 0;
     const LargeClusters staged(kinds.large, limits);
     ASSERT(staged.getForm().isStaged && !staged.getForm().isInLocalMemory && staged.getForm().areRecords);
+    // Little memory gets smaller pieces.
+    limits.numResident = 132;
+    limits.localMemory = 20 * 1024;
+    const LargeClusters little(kinds.large, limits);
+    ASSERT(little.getForm().isInLocalMemory && 16 * little.getLocalSize() <= limits.localMemory);
+    ASSERT(little.getPieces().size() > waiting.getPieces().size());
     // Few processors get larger pieces.
+    limits.localMemory = 40 * 1024;
     limits.numResident = 14;
     const LargeClusters few(kinds.large, limits);
     ASSERT(!few.getForm().isStaged && few.getPieces().size() <= 15);
