@@ -89,38 +89,39 @@ inline DEVICE void applyRecord(const int pass, uint4 record, MEMORY const index_
         A[target] = value;
     }
     else if (pass == FORWARD) { // x[t] -= A[a] x[k]
-        const word_t last = (count == 3 ? record.w : 0);
         real value = x[target];
-        const real first = A[LOW(record.y)]*x[HIGH(record.y)], second = A[LOW(record.z)]*x[HIGH(record.z)], third = A[LOW(last)]*x[HIGH(last)];
+        const real first = A[LOW(record.y)]*x[HIGH(record.y)], second = A[LOW(record.z)]*x[HIGH(record.z)];
         value -= first;
         if (count > 1)
             value -= second;
-        if (count == 3)
-            value -= third;
-        int at = (int) record.w;
-        KEEP_LOOP for (int i = 2; i < (count > 3 ? count : 0); i++, at += 2)
-            value -= A[more[at]]*x[more[at+1]];
+        if (count > 2) { // few
+            if (count == 3)
+                value -= A[LOW(record.w)]*x[HIGH(record.w)];
+            int at = (int) record.w;
+            KEEP_LOOP for (int i = 2; i < (count > 3 ? count : 0); i++, at += 2)
+                value -= A[more[at]]*x[more[at+1]];
+        }
         x[target] = value;
     }
     else { // x[k] = x[k]/D[k] - sum A[a + i] x[rows[i]]
         const int a = LOW(record.y);
-        const word_t last = (count > 5 ? 0 : record.w);
         real value = x[target]*A[target];
         const real first = A[a]*x[HIGH(record.y)], second = A[a+1]*x[LOW(record.z)], third = A[a+2]*x[HIGH(record.z)];
-        const real fourth = A[a+3]*x[LOW(last)], fifth = A[a+4]*x[HIGH(last)];
         if (count > 0)
             value -= first;
         if (count > 1)
             value -= second;
         if (count > 2)
             value -= third;
-        if (count == 4 || count == 5)
-            value -= fourth;
-        if (count == 5)
-            value -= fifth;
-        const int at = (int) record.w;
-        KEEP_LOOP for (int i = 3; i < (count > 5 ? count : 0); i++)
-            value -= A[a+i]*x[more[at+i-3]];
+        if (count > 3) { // few
+            if (count <= 5)
+                value -= A[a+3]*x[LOW(record.w)];
+            if (count == 5)
+                value -= A[a+4]*x[HIGH(record.w)];
+            const int at = (int) record.w;
+            KEEP_LOOP for (int i = 3; i < (count > 5 ? count : 0); i++)
+                value -= A[a+i]*x[more[at+i-3]];
+        }
         x[target] = value;
     }
 }
@@ -704,17 +705,21 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         const bool isFine = (phase == POSITIONS && stage > 0 && flags[now] == 0);
         KEEP_LOOP for (int k = THREAD; k < (isFine ? numInner : 0); k += NUM_THREADS)
             x[k] = 0;
+#if HAS_JOINTS
+        // The particles of the joints are sent first, since they are known.
+        const word_t stamp = (task.stamp + (word_t) stage) | (phase == POSITIONS && !isFine ? 0x80000000u : 0u);
+        const int numSent = (phase != COMPLETE ? numBorders : 0), stride = WORDS_PER_VALUE*numJoints;
+        GLOBAL volatile mm_ulong* outbox = channel + now*8*stride;
+        KEEP_LOOP for (int b = THREAD; b < numSent; b += NUM_THREADS) {
+            const int joint = borders[b]>>1, side = borders[b] & 1, i = ends[2*(numInner+b)+side];
+            UNROLL for (int d = 0; d < 3; d++)
+                sendValue(outbox + (4*side + d + 1)*stride + joint, numJoints, D[3*i+d], stamp);
+        }
+#endif
         RUN_FORWARD(phase == COMPLETE || isFine ? 0 : numLevels);
 #if HAS_JOINTS
-        const word_t stamp = (task.stamp + (word_t) stage) | (phase == POSITIONS && !isFine ? 0x80000000u : 0u);
-        GLOBAL volatile mm_ulong* outbox = channel + now*8*WORDS_PER_VALUE*numJoints;
-        KEEP_LOOP for (int b = THREAD; b < (phase != COMPLETE ? numBorders : 0); b += NUM_THREADS) {
-            const int joint = borders[b]>>1, side = borders[b] & 1, k = numInner + b, i = (side == 0 ? ends[2*k] : ends[2*k+1]);
-            GLOBAL volatile mm_ulong* words = outbox + side*4*WORDS_PER_VALUE*numJoints + joint;
-            sendValue(words, numJoints, x[k], stamp);
-            UNROLL for (int d = 0; d < 3; d++)
-                sendValue(words + (d + 1)*WORDS_PER_VALUE*numJoints, numJoints, D[3*i+d], stamp);
-        }
+        KEEP_LOOP for (int b = THREAD; b < numSent; b += NUM_THREADS)
+            sendValue(outbox + 4*(borders[b] & 1)*stride + (borders[b]>>1), numJoints, x[numInner+b], stamp);
 #endif
     }
     if (mode == FINISH && !isRegular && task.canFail)
