@@ -14,6 +14,9 @@ using std::vector;
 
 namespace {
 
+// Differences of the velocities of particles that are the same but for the rounding of both.
+const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
+
 const int MAX_CHORD_ITERATIONS = 12, MAX_NEWTON_ITERATIONS = 50;
 // If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
 const double SLOW_CONVERGENCE = 0.25;
@@ -656,6 +659,21 @@ void ConstraintSolver::moveToEnd() {
 }
 
 // ------------------------------------------------------------------------------------------------------------- anywhere
+
+bool ConstraintSolver::findFrameShift(const Vectors& before, const Vectors& after, Vec3& shift) {
+    if (!system.isTranslationInvariant() || movingParticles.empty())
+        return false;
+    const int one = movingParticles[0];
+    shift = after[one] - before[one];
+    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
+    const double reference = sizeOf(shift) + sizeOf(before[one]);
+    const double numOthers = largest((int) movingParticles.size(), [&](int p) {
+        const int i = movingParticles[p];
+        const bool isShifted = sizeOf(after[i] - before[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(before[i]));
+        return isShifted ? 0.0 : 1.0;
+    });
+    return numOthers == 0;
+}
 
 bool ConstraintSolver::projectPositions(Vectors& positions, const ExpressionParameters& parameters) {
     if (system.getNumConstraints() == 0)

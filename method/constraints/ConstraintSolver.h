@@ -96,6 +96,12 @@ public:
         }
     };
     int getNumRanges() const;
+    /**
+     * Whether velocities are others seen from a uniformly moving frame, but for rounding, and constraints know nothing of that.
+     *
+     * @param[out] shift    the velocity of the frame, with the opposite sign
+     */
+    bool findFrameShift(const Vectors& before, const Vectors& after, OpenMM::Vec3& shift);
     /** Go through all ranges, task(range, first, end), on one thread. */
     template <class Task> void forRanges(const Task& task) const {
         for (size_t block = 0; block + 1 < system.getBlocks().size(); block++)

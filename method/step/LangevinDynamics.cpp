@@ -26,8 +26,8 @@ const double FLIGHT_LENGTH = 0.0125, POWER = 2.0 / 3.0, TRIGGER = 2.2;
 const double FLOOR = 0.5, FLOOR_PART = 0.2, LARGEST_START = 4, FOLLOWING_RATE = 0.002;
 // What is thermal in a bath that is colder than this (K).
 const double COLDEST = 10;
-// Differences of the velocities of particles that are the same but for the rounding of both.
-const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
+// A change of all velocities by less than this part of their mean size leaves U what it is.
+const double SMALL_SHIFT = 0.05;
 // The drifts are solved to this fraction of the tolerance: what is left is not the same forwards and backwards.
 const double MARGIN = 0.1;
 const int NO_LIMIT = std::numeric_limits<int>::max();
@@ -247,18 +247,20 @@ void LangevinDynamics::resume(const Vectors& positions, const Vectors& velocitie
 }
 
 bool LangevinDynamics::changeFrame(const Vectors& velocities) {
-    const vector<int>& particles = solver.getMovingParticles();
-    if (!getConstraintSystem().isTranslationInvariant() || particles.empty())
+    Vec3 shift;
+    if (!solver.findFrameShift(v, velocities, shift))
         return false;
-    const Vec3 shift = velocities[particles[0]] - v[particles[0]];
-    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
-    const double largest = sizeOf(shift) + sizeOf(v[particles[0]]);
-    for (int i : particles)
-        if (!(sizeOf(velocities[i] - v[i] - shift) <= FRAME_ROUNDING * (largest + sizeOf(v[i]))))
-            return false;
-    for (int i : particles)
-        v[i] = velocities[i];
-    values[0] = evaluateMonitor(q, theta, v, force, lambda);
+    const vector<int>& particles = solver.getMovingParticles();
+    const double count = (double) particles.size(), square = shift.dot(shift);
+    const double squares =
+        solver.sum((int) particles.size(), [&](int p) { return v[particles[p]].dot(v[particles[p]]); });
+    solver.share((int) particles.size(), [&](int first, int end) {
+        for (int p = first; p < end; p++)
+            v[particles[p]] = velocities[particles[p]];
+    });
+    // What is removed in each step is less than U is known to.
+    if (square * count > SMALL_SHIFT * SMALL_SHIFT * squares)
+        values[0] = evaluateMonitor(q, theta, v, force, lambda);
     return true;
 }
 

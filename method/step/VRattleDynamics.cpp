@@ -4,7 +4,6 @@
 #include "step/VRattleDynamics.h"
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -12,8 +11,6 @@ using std::vector;
 
 namespace {
 
-// Differences of the velocities of particles that are the same but for the rounding of both.
-const double FRAME_ROUNDING = 4 * std::numeric_limits<double>::epsilon();
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
 // A relative change of the velocities that starts no oscillation to speak of.
@@ -186,19 +183,9 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
 
 bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
     const vector<int>& movingParticles = constraints.getMovingParticles();
-    if (!getConstraintSystem().isTranslationInvariant() || movingParticles.empty())
-        return false;
-    const Vec3 shift = velocities[movingParticles[0]] - now.v[movingParticles[0]];
-    auto sizeOf = [](const Vec3& x) { return std::fabs(x[0]) + std::fabs(x[1]) + std::fabs(x[2]); };
-    const double reference = sizeOf(shift) + sizeOf(now.v[movingParticles[0]]);
     const int count = (int) movingParticles.size();
-    const double numOthers = constraints.largest(count, [&](int p) {
-        const int i = movingParticles[p];
-        const bool isShifted =
-            sizeOf(velocities[i] - now.v[i] - shift) <= FRAME_ROUNDING * (reference + sizeOf(now.v[i]));
-        return isShifted ? 0.0 : 1.0;
-    });
-    if (numOthers > 0)
+    Vec3 shift;
+    if (!constraints.findFrameShift(now.v, velocities, shift))
         return false;
     constraints.share(count, [&](int first, int end) {
         for (int p = first; p < end; p++) {

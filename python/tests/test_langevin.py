@@ -8,8 +8,12 @@ What it samples is tested in test_langevin_sampling.py.
 from __future__ import annotations
 
 import copy
+import importlib.util
 import inspect
+import json
 import pickle
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -628,3 +632,41 @@ def test_replica_exchange_and_expanded_ensemble() -> None:
     expanded = app.ExpandedEnsembleSampler(states, simulation(integrator), 5)
     expanded.step(20)
     assert integrator.getTemperature()._value in (300, 310, 320)
+
+
+def test_the_benchmark_of_robustness(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A clash of two waters: ours survives, OpenMM's does not, and the file says so."""
+    script = Path(__file__).parents[2] / "benchmarks" / "robustness.py"
+    if not script.exists():
+        pytest.skip("needs the folder benchmarks")
+    specification = importlib.util.spec_from_file_location("robustness", script)
+    benchmark = importlib.util.module_from_spec(specification)
+    sys.modules["robustness"] = benchmark
+    specification.loader.exec_module(benchmark)
+    arguments = ["--rows", "clash 0.5, 2 fs", "--starts", "1", "--integrators", "ours", "LangevinMiddle"]
+    assert benchmark.main([*arguments, "--output", str(tmp_path)]) == 0
+    ours, theirs = (json.loads(line) for line in (tmp_path / "robustness.jsonl").read_text().splitlines())
+    assert (ours["integrator"], ours["survived"]) == ("ours", True)
+    assert (theirs["integrator"], theirs["survived"]) == ("LangevinMiddle", False)
+    assert 1 < ours["evaluations"] < 1.5
+    assert "| clash 0.5, 2 fs | ours | 1/1 |" in capsys.readouterr().out
+
+
+def test_the_reference_is_set_kept_and_let_go() -> None:
+    context, integrator = make_context()
+    assert integrator.getReferenceMonitorValue() == 0
+    integrator.step(1)
+    found = integrator.getReferenceMonitorValue()
+    assert found > 0
+    integrator.freezeReference(True)
+    integrator.step(3)
+    assert integrator.getReferenceMonitorValue() == found
+    integrator.freezeReference(False)
+    integrator.setReferenceMonitorValue(2 * found)
+    integrator.step(3)
+    assert integrator.getReferenceMonitorValue() == 2 * found
+    integrator.setReferenceMonitorValue(0)
+    integrator.step(1)
+    assert integrator.getReferenceMonitorValue() == pytest.approx(2 * found, rel=0.0021)
+    assert integrator.getReferenceMonitorValue() != 2 * found
+    assert context.getStepCount() == 8
