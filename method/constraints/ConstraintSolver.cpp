@@ -749,10 +749,22 @@ bool ConstraintSolver::projectByNewton(const ExpressionParameters& parameters, V
 
 void ConstraintSolver::subtractConstraintForces(const Vectors& positions, const ExpressionParameters& parameters,
                                                 const vector<double>& x, Vectors& forces) {
-    system.evaluateJacobian(positions, parameters, velocityJacobian);
-    for (size_t k = 0; k < x.size(); k++)
-        before[k] = -x[k];
-    system.addTransposed(velocityJacobian, before, forces);
+    auto subtract = [&](const Part& part) {
+        system.evaluateJacobian(positions, parameters, velocityJacobian, part);
+        for (int k = part.first; k < part.end; k++)
+            before[k] = -x[k];
+        system.addTransposed(velocityJacobian, before, forces, part);
+    };
+    work.run([](int) {},
+             [&](const ClusterBatch& batch, int begin, int end, Result&) {
+                 Part part = {};
+                 part.first = batch.getFirstConstraint(begin);
+                 part.end = batch.getFirstConstraint(end);
+                 subtract(part);
+             },
+             [](int) {}, [&](const Part& part, Result&) { subtract(part); },
+             [&](const Part& piece, Result&) { subtract(piece); });
+    work.runOnJoints([&](const CutCluster& cluster) { subtract(cluster.joints); });
 }
 
 void ConstraintSolver::subtractConstraintAccelerations(const Vectors& positions, const ExpressionParameters& parameters,

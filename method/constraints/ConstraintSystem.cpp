@@ -64,7 +64,7 @@ void ConstraintSystem::findParameterChange(const vector<Vec3>& q, const Expressi
     along.rates = change;
     along.isMoving = true;
     vector<double> before(getNumConstraints()), after(getNumConstraints()), linear(getNumConstraints());
-    forGroups(ALL, [&](ExpressionGroup& group, int first, int end) {
+    forGroups(ALL, [&](const ExpressionGroup& group, int first, int end) {
         group.evaluate(q, theta, before, first, end);
         group.evaluate(q, there, after, first, end);
         group.addParameterMotion(q, along, linear, first, end);
@@ -218,7 +218,7 @@ double ConstraintSystem::evaluate(const vector<Vec3>& q, const ExpressionParamet
         g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
         keepLargest(std::fabs(g[k]));
     });
-    forGroups(part, [&](ExpressionGroup& group, int first, int end) { group.evaluate(q, theta, g, first, end); });
+    forGroups(part, [&](const ExpressionGroup& group, int first, int end) { group.evaluate(q, theta, g, first, end); });
     forRows(part, [&](const ExpressionRow& row) { keepLargest(findErrorOf(row, g, nearby)); });
     return largest;
 }
@@ -284,7 +284,7 @@ void ConstraintSystem::evaluateDistanceRows(const vector<Vec3>& x, Jacobian& jac
 void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, const ExpressionParameters& theta, Jacobian& jacobian,
                                         const Part& part) const {
     evaluateDistanceRows(q, jacobian, part);
-    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+    forGroups(part, [&](const ExpressionGroup& group, int first, int end) {
         group.evaluateJacobian(q, theta, jacobian, first, end);
     });
 }
@@ -292,7 +292,7 @@ void ConstraintSystem::evaluateJacobian(const vector<Vec3>& q, const ExpressionP
 void ConstraintSystem::addParameterMotion(const vector<Vec3>& q, const ExpressionParameters& theta,
                                           vector<double>& result, const Part& part) const {
     if (theta.isMoving)
-        forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+        forGroups(part, [&](const ExpressionGroup& group, int first, int end) {
             group.addParameterMotion(q, theta, result, first, end);
         });
 }
@@ -301,7 +301,7 @@ void ConstraintSystem::evaluateVelocityJacobian(const vector<Vec3>& q, const vec
                                                 const ExpressionParameters& theta, Jacobian& jacobian,
                                                 const Part& part) const {
     evaluateDistanceRows(v, jacobian, part);
-    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+    forGroups(part, [&](const ExpressionGroup& group, int first, int end) {
         group.evaluateVelocityJacobian(q, v, theta, jacobian, first, end);
     });
 }
@@ -334,14 +334,17 @@ void ConstraintSystem::multiplyOverMass(const Jacobian& jacobian, const vector<V
     });
 }
 
-void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result) const {
-    forDistances(ALL, [&](int k) {
+void ConstraintSystem::addTransposed(const Jacobian& jacobian, const vector<double>& x, vector<Vec3>& result,
+                                     const Part& part) const {
+    forDistances(part, [&](int k) {
         Vec3 force = jacobian[k] * x[k];
         result[constraints[k].particle1] += force;
         result[constraints[k].particle2] -= force;
     });
-    for (size_t e = 0; e < expressionEntries.size(); e++)
-        result[expressionEntries[e].particle] += jacobian[getNumConstraints() + e] * x[expressionEntries[e].constraint];
+    forRows(part, [&](const ExpressionRow& row) {
+        for (int entry = row.first; entry < row.end; entry++)
+            result[getParticleOf(entry)] += jacobian[entry] * x[row.constraint];
+    });
 }
 
 void ConstraintSystem::addTransposedOverMass(const Jacobian& jacobian, const vector<double>& x, double scale,
@@ -372,7 +375,7 @@ void ConstraintSystem::evaluateCurvature(const vector<Vec3>& q, const vector<Vec
         Vec3 w = v[constraints[k].particle1] - v[constraints[k].particle2];
         result[k] = w.dot(w) * inverseSquareLengths[k];
     });
-    forGroups(part, [&](ExpressionGroup& group, int first, int end) {
+    forGroups(part, [&](const ExpressionGroup& group, int first, int end) {
         group.evaluateCurvature(q, v, theta, result, first, end);
     });
 }

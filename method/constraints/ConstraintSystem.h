@@ -278,8 +278,9 @@ public:
     /** G M^-1 f. */
     void multiplyOverMass(const Jacobian& jacobian, const std::vector<OpenMM::Vec3>& f, std::vector<double>& result,
                           const Part& part = ALL) const;
-    /** result += G^T x, as forces on the particles. */
-    void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result) const;
+    /** result += G^T x, as forces on the particles; for a piece, what its own constraints do. */
+    void addTransposed(const Jacobian& jacobian, const std::vector<double>& x, std::vector<OpenMM::Vec3>& result,
+                       const Part& part = ALL) const;
     /** result += scale M^-1 G^T x; for a piece, what all constraints do to its particles. */
     void addTransposedOverMass(const Jacobian& jacobian, const std::vector<double>& x, double scale,
                                std::vector<OpenMM::Vec3>& result, const Part& part = ALL) const;

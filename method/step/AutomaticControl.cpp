@@ -84,10 +84,9 @@ void requireFinite(double value, const char* name) {
 } // namespace
 
 AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
-        system(solver.getSystem()), clusterForces(solver), movingParticles(solver.getMovingParticles()),
-        clusterOfParticle(clusterForces.getClusters()), numClusters(clusterForces.getNumClusters()), references(),
-        memory(), temperature(0), measured() {
-    numDegreesOfFreedom = std::max(1.0, 3.0 * (double) movingParticles.size() - system.getNumConstraints());
+        solver(solver), system(solver.getSystem()), clusterForces(solver), numClusters(clusterForces.getNumClusters()),
+        references(), memory(), temperature(0), measured() {
+    numDegreesOfFreedom = std::max(1.0, 3.0 * (double) solver.getMovingParticles().size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
 }
@@ -98,26 +97,33 @@ AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
 void AutomaticControl::findSquares(const State& state, vector<double>& squares) {
     const vector<Vec3>& netForces =
         clusterForces.findNetForces(state.positions, state.parameters, state.forces, state.multipliers);
-    std::fill(squares.begin(), squares.end(), 0.0);
-    temperature = 0;
-    for (size_t p = 0; p < movingParticles.size(); p++) {
-        const int i = movingParticles[p];
-        const double mass = system.getMasses()[i], speedSquared = state.velocities[i].dot(state.velocities[i]);
-        squares[clusterOfParticle[p]] += netForces[i].dot(netForces[i]) * system.getInverseMasses()[i] +
-                                         mass * speedSquared * speedSquared / (FLIGHT * FLIGHT);
-        temperature += mass * speedSquared / numDegreesOfFreedom;
-    }
+    const vector<double>&masses = system.getMasses(), &inverseMasses = system.getInverseMasses();
+    clusterForces.forClusters([&](int c, const int* first, const int* end) {
+        double sum = 0;
+        for (const int* i = first; i < end; i++) {
+            const double speedSquared = state.velocities[*i].dot(state.velocities[*i]);
+            sum += netForces[*i].dot(netForces[*i]) * inverseMasses[*i] +
+                   masses[*i] * speedSquared * speedSquared / (FLIGHT * FLIGHT);
+        }
+        squares[c] = sum;
+    });
+    const vector<int>& moving = solver.getMovingParticles();
+    temperature = solver.sum((int) moving.size(), [&](int p) {
+        return masses[moving[p]] * state.velocities[moving[p]].dot(state.velocities[moving[p]]) / numDegreesOfFreedom;
+    });
 }
 
 // U_A from S_c
 double AutomaticControl::evaluateOnStep(const State& state, const vector<double>& squares) {
-    scratch = squares;
-    for (size_t p = 0; p < movingParticles.size(); p++) {
-        const int i = movingParticles[p];
-        const Vec3 &force = state.forces[i], &v = state.velocities[i];
-        scratch[clusterOfParticle[p]] += std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
-    }
-    return ClusterForces::eighthRootOfFourthPowers(scratch);
+    clusterForces.forClusters([&](int c, const int* first, const int* end) {
+        double sum = squares[c];
+        for (const int* i = first; i < end; i++) {
+            const Vec3 &force = state.forces[*i], &v = state.velocities[*i];
+            sum += std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
+        }
+        scratch[c] = sum;
+    });
+    return clusterForces.eighthRootOfFourthPowers(scratch);
 }
 
 void AutomaticControl::begin(const State& state) {
@@ -130,15 +136,13 @@ void AutomaticControl::measure(const State& state, const vector<Vec3>& w, double
     findSquares(state, measuredSquares);
     measured[OnStep] = evaluateOnStep(state, measuredSquares);
     requireFinite(measured[OnStep], "U_A");
-    std::fill(scratch.begin(), scratch.end(), 0.0);
-    for (size_t p = 0; p < movingParticles.size(); p++) {
-        const int i = movingParticles[p];
-        scratch[clusterOfParticle[p]] += w[i].dot(state.forces[i] - oldForce[i]);
-    }
-    for (int c = 0; c < numClusters; c++)
-        scratch[c] =
-            CHANGE_WEIGHT * 2 / size * std::fabs(scratch[c]) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
-    measured[HalfStep] = ClusterForces::eighthRootOfFourthPowers(scratch);
+    clusterForces.forClusters([&](int c, const int* first, const int* end) {
+        double work = 0;
+        for (const int* i = first; i < end; i++)
+            work += w[*i].dot(state.forces[*i] - oldForce[*i]);
+        scratch[c] = CHANGE_WEIGHT * 2 / size * std::fabs(work) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
+    });
+    measured[HalfStep] = clusterForces.eighthRootOfFourthPowers(scratch);
     requireFinite(measured[HalfStep], "U_B");
 }
 

@@ -153,9 +153,9 @@ private:
     void follow(double part);
     void raiseReferences();
 
+    ConstraintSolver& solver;
     const ConstraintSystem& system;
     ClusterForces clusterForces;
-    const std::vector<int>&movingParticles, &clusterOfParticle;
     int numClusters;
     double numDegreesOfFreedom;
     Settings settings;

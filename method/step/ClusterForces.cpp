@@ -2,7 +2,9 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/ClusterForces.h"
+#include <algorithm>
 #include <cmath>
+#include <numeric>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -20,12 +22,22 @@ ClusterForces::ClusterForces(ConstraintSolver& solver) :
             clusters[i] = numClusters++;
         clusterOfParticle.push_back(clusters[i]);
     }
+    firstParticles.assign(numClusters + 1, 0);
+    for (int c : clusterOfParticle)
+        firstParticles[c + 1]++;
+    std::partial_sum(firstParticles.begin(), firstParticles.end(), firstParticles.begin());
+    particles.resize(clusterOfParticle.size() + 1); // one more, so that the end of all has an address
+    vector<int> place = firstParticles;
+    for (size_t p = 0; p < clusterOfParticle.size(); p++)
+        particles[place[clusterOfParticle[p]]++] = solver.getMovingParticles()[p];
     netForces.resize(system.getNumParticles());
 }
 
 const vector<Vec3>& ClusterForces::findNetForces(const vector<Vec3>& positions, const ExpressionParameters& parameters,
                                                  const vector<Vec3>& forces, const vector<double>& multipliers) {
-    netForces = forces;
+    solver.share((int) forces.size(), [&](int first, int end) {
+        std::copy(forces.begin() + first, forces.begin() + end, netForces.begin() + first);
+    });
     solver.subtractConstraintForces(positions, parameters, multipliers, netForces);
     return netForces;
 }
@@ -46,9 +58,7 @@ std::string ClusterForces::describe(int cluster) const {
     return text;
 }
 
-double ClusterForces::eighthRootOfFourthPowers(const vector<double>& x) {
-    double sum = 0;
-    for (double each : x)
-        sum += (each * each) * (each * each);
+double ClusterForces::eighthRootOfFourthPowers(const vector<double>& x) const {
+    const double sum = solver.sum((int) x.size(), [&](int c) { return (x[c] * x[c]) * (x[c] * x[c]); });
     return std::sqrt(std::sqrt(std::sqrt(sum)));
 }

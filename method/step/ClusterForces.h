@@ -25,6 +25,13 @@ public:
     const std::vector<int>& getClusters() const {
         return clusterOfParticle;
     }
+    /** Go through the clusters, on several threads where that is faster: task(cluster, its first moving particle, the end of these). */
+    template <class Task> void forClusters(const Task& task) const {
+        solver.share(numClusters, [&](int first, int end) {
+            for (int c = first; c < end; c++)
+                task(c, &particles[firstParticles[c]], &particles[firstParticles[c + 1]]);
+        });
+    }
     /** N, valid until the next call. */
     const std::vector<OpenMM::Vec3>& findNetForces(const std::vector<OpenMM::Vec3>& positions,
                                                    const ExpressionParameters& parameters,
@@ -33,12 +40,13 @@ public:
     /** The particles of a cluster in words, for messages. */
     std::string describe(int cluster) const;
     /** (sum x^4)^(1/8), so that the largest count most. */
-    static double eighthRootOfFourthPowers(const std::vector<double>& x);
+    double eighthRootOfFourthPowers(const std::vector<double>& x) const;
 
 private:
     ConstraintSolver& solver;
     std::vector<int> clusterOfParticle;
     int numClusters;
+    std::vector<int> firstParticles, particles; // of each cluster; one more than there are, which is the end of all
     std::vector<OpenMM::Vec3> netForces;
 };
 

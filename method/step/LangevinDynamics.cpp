@@ -52,7 +52,7 @@ LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<Di
     clusterSums.resize(clusterForces.getNumClusters());
     for (int cluster : clusterForces.getClusters())
         clusterSums[cluster] += 1;
-    systemSize = ClusterForces::eighthRootOfFourthPowers(clusterSums);
+    systemSize = clusterForces.eighthRootOfFourthPowers(clusterSums);
 }
 
 void LangevinDynamics::setParallel(const Parallel& parallel, int numThreads) {
@@ -133,7 +133,7 @@ double LangevinDynamics::evaluateMonitor(const Vectors& positions, const Express
     std::fill(clusterSums.begin(), clusterSums.end(), 0.0);
     for (size_t p = 0; p < particles.size(); p++)
         clusterSums[clusterForces.getClusters()[p]] += particleShares[p];
-    return ClusterForces::eighthRootOfFourthPowers(clusterSums);
+    return clusterForces.eighthRootOfFourthPowers(clusterSums);
 }
 
 // The first of the particles with mass whose vector is no number, or -1.
