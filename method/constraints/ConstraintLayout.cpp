@@ -403,6 +403,8 @@ void ConstraintSystem::groupExpressions(const Given& given) {
         numParameters += (int) c.parameters.size();
         placeInGroups[e] = {group, groupSizes[group]++};
     }
+    for (const auto& group : groups)
+        group->compile();
 }
 
 void ConstraintSystem::findStretches() {

@@ -49,18 +49,21 @@ void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int
     }
 }
 
-// A program, made when it is first needed, which may be by several threads at once.
-const ArrayExpression& ExpressionGroup::require(Program& program, const std::function<vector<int>()>& findOutputs) {
-    std::lock_guard<std::mutex> lock(mutex);
-    if (program == nullptr) {
-        vector<int> inputs = coordinates;
-        inputs.insert(inputs.end(), velocities.begin(), velocities.end());
-        inputs.insert(inputs.end(), parameters.begin(), parameters.end());
-        inputs.insert(inputs.end(), parameterRates.begin(), parameterRates.end());
-        const vector<int> outputs = findOutputs();
-        program.reset(new ArrayExpression(graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
+ExpressionGroup::Program ExpressionGroup::make(const vector<int>& outputs) const {
+    vector<int> inputs = coordinates;
+    for (const vector<int>* more : {&velocities, &parameters, &parameterRates})
+        inputs.insert(inputs.end(), more->begin(), more->end());
+    return Program(new ArrayExpression(graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
+}
+
+void ExpressionGroup::compile() {
+    valueProgram = make({value});
+    jacobianProgram = make(graph.findGradient(value, coordinates));
+    motionProgram = make({parameterMotion});
+    for (int i = 0; i < 2; i++) {
+        curvaturePrograms[i] = make({curvature[i]});
+        velocityJacobianPrograms[i] = make(graph.findGradient(rate[i], coordinates));
     }
-    return *program;
 }
 
 // Run a program on the constraints of a range, block by block, and call store(work, first, count) after each.
@@ -143,31 +146,27 @@ void ExpressionGroup::runRows(const ArrayExpression& program, const Range& range
 }
 
 void ExpressionGroup::evaluate(const vector<Vec3>& q, const ExpressionParameters& theta, vector<double>& g, int first,
-                               int end) {
-    runValues(require(valueProgram, [&] { return vector<int>{value}; }), {q, nullptr, theta, first, end}, g, false);
+                               int end) const {
+    runValues(*valueProgram, {q, nullptr, theta, first, end}, g, false);
 }
 
 void ExpressionGroup::evaluateJacobian(const vector<Vec3>& q, const ExpressionParameters& theta, vector<Vec3>& jacobian,
-                                       int first, int end) {
-    runRows(require(jacobianProgram, [&] { return graph.findGradient(value, coordinates); }),
-            {q, nullptr, theta, first, end}, jacobian);
+                                       int first, int end) const {
+    runRows(*jacobianProgram, {q, nullptr, theta, first, end}, jacobian);
 }
 
 void ExpressionGroup::addParameterMotion(const vector<Vec3>& q, const ExpressionParameters& theta,
-                                         vector<double>& result, int first, int end) {
-    runValues(require(motionProgram, [&] { return vector<int>{parameterMotion}; }), {q, nullptr, theta, first, end},
-              result, true);
+                                         vector<double>& result, int first, int end) const {
+    runValues(*motionProgram, {q, nullptr, theta, first, end}, result, true);
 }
 
 void ExpressionGroup::evaluateCurvature(const vector<Vec3>& q, const vector<Vec3>& v, const ExpressionParameters& theta,
-                                        vector<double>& result, int first, int end) {
-    auto findOutputs = [&] { return vector<int>{curvature[theta.isMoving]}; };
-    runValues(require(curvaturePrograms[theta.isMoving], findOutputs), {q, &v, theta, first, end}, result, false);
+                                        vector<double>& result, int first, int end) const {
+    runValues(*curvaturePrograms[theta.isMoving], {q, &v, theta, first, end}, result, false);
 }
 
 void ExpressionGroup::evaluateVelocityJacobian(const vector<Vec3>& q, const vector<Vec3>& v,
                                                const ExpressionParameters& theta, vector<Vec3>& jacobian, int first,
-                                               int end) {
-    auto findOutputs = [&] { return graph.findGradient(rate[theta.isMoving], coordinates); };
-    runRows(require(velocityJacobianPrograms[theta.isMoving], findOutputs), {q, &v, theta, first, end}, jacobian);
+                                               int end) const {
+    runRows(*velocityJacobianPrograms[theta.isMoving], {q, &v, theta, first, end}, jacobian);
 }

@@ -6,10 +6,8 @@
 
 #include "expressions/ArrayExpression.h"
 #include "openmm/Vec3.h"
-#include <functional>
 #include <map>
 #include <memory>
-#include <mutex>
 #include <string>
 #include <vector>
 
@@ -44,7 +42,7 @@ public:
     /** @param example    a constraint of the group */
     explicit ExpressionGroup(const ExpressionConstraint& example);
     /**
-     * Add a constraint, all of them before the first evaluation.
+     * Add a constraint, all of them before compile().
      *
      * @param constraint        the constraint
      * @param index             its place in arrays of constraints
@@ -54,26 +52,28 @@ public:
      */
     void add(const ExpressionConstraint& constraint, int index, int firstEntry, int firstParameter,
              const std::vector<double>& inverseMasses);
+    /** Make the programs that evaluate what there is, when all have been added. */
+    void compile();
     int getNumConstraints() const {
         return (int) indices.size();
     }
 
     /** g(q) */
     void evaluate(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta, std::vector<double>& g,
-                  int first, int end);
+                  int first, int end) const;
     /** The rows of G(q) = dg/dq. */
     void evaluateJacobian(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
-                          std::vector<OpenMM::Vec3>& jacobian, int first, int end);
+                          std::vector<OpenMM::Vec3>& jacobian, int first, int end) const;
     /** result += dg/dtheta . rates, the change of g in time at fixed q. */
     void addParameterMotion(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta,
-                            std::vector<double>& result, int first, int end);
+                            std::vector<double>& result, int first, int end) const;
     /** g''(v,v) at q, the second derivative of g along the motion of the particles and of the parameters. */
     void evaluateCurvature(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
-                           const ExpressionParameters& theta, std::vector<double>& result, int first, int end);
+                           const ExpressionParameters& theta, std::vector<double>& result, int first, int end) const;
     /** The rows (d^2g/dq^2 v)^T at q, the derivative of G along the motion of the particles and of the parameters. */
     void evaluateVelocityJacobian(const std::vector<OpenMM::Vec3>& q, const std::vector<OpenMM::Vec3>& v,
                                   const ExpressionParameters& theta, std::vector<OpenMM::Vec3>& jacobian, int first,
-                                  int end);
+                                  int end) const;
 
 private:
     /**
@@ -81,7 +81,7 @@ private:
      * work on stays in the processor's nearest memory.
      */
     static constexpr int MAX_BLOCK_SIZE = 64, NO_ENTRY = -1;
-    typedef std::unique_ptr<ArrayExpression> Program;
+    typedef std::unique_ptr<const ArrayExpression> Program;
     /** What a program works on: positions, perhaps velocities, parameters, and the constraints first, ..., end - 1. */
     struct Range {
         const std::vector<OpenMM::Vec3>& q;
@@ -89,7 +89,7 @@ private:
         const ExpressionParameters& theta;
         int first, end;
     };
-    const ArrayExpression& require(Program& program, const std::function<std::vector<int>()>& findOutputs);
+    Program make(const std::vector<int>& outputs) const;
     template <class Store> void run(const ArrayExpression& program, const Range& range, const Store& store) const;
     void runValues(const ArrayExpression& program, const Range& range, std::vector<double>& result, bool mustAdd) const;
     void runRows(const ArrayExpression& program, const Range& range, std::vector<OpenMM::Vec3>& jacobian) const;
@@ -100,10 +100,8 @@ private:
     // Nodes: g, its derivative along the motion of the parameters alone, the one along v, and the derivative of this along v.
     // Of two, the second is along the motion of the parameters too.
     int value, parameterMotion, rate[2], curvature[2];
-    // Made when they are first needed, as of nodes.
     Program valueProgram, jacobianProgram, motionProgram, curvaturePrograms[2], velocityJacobianPrograms[2];
     std::vector<int> indices, firstParameters, particles, entries; // NO_ENTRY for a particle without mass
-    std::mutex mutex; // of the making of programs
 };
 
 } // namespace OpenMMVRattle

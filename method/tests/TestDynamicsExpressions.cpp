@@ -119,6 +119,7 @@ struct Sample {
         }
         group.reset(new ExpressionGroup(constraint));
         group->add(constraint, 0, 0, 0, {1, 1, 1});
+        group->compile();
         theta.values = {0.7, -0.4};
         theta.rates = {0, 0};
     }
@@ -317,6 +318,7 @@ void testGroups() {
         ExpressionGroup together(example);
         for (int i = 0; i < count; i++)
             together.add(constraints[i], count - 1 - i, 2 * i, 2 * i, inverseMasses);
+        together.compile();
         ExpressionParameters theta;
         for (int i = 0; i < count; i++)
             for (const char* name : {"d", "k"})
@@ -333,6 +335,7 @@ void testGroups() {
         for (int i = 0; i < count; i++) {
             ExpressionGroup alone(constraints[i]);
             alone.add(constraints[i], 0, 0, 0, inverseMasses);
+            alone.compile();
             const ExpressionParameters own{{theta.values[2 * i], theta.values[2 * i + 1]}, {}, false};
             vector<double> number(1);
             vector<Vec3> row(2), velocityRow(2);
