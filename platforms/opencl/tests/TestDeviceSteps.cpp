@@ -489,15 +489,16 @@ void testChangedVelocities() {
     }
 }
 
-// A cluster that cannot be solved in step 31 of 60, beside others that can: a dumbbell that flies into a wall.
-void testFailureLeavesTheStateBefore(const std::string& precision) {
+// A cluster that cannot be solved in step 31 of 60, beside others that can: a dumbbell, or a zigzag, that flies into a wall.
+void testFailureLeavesTheStateBefore(const std::string& precision, int length = 1) {
     Molecules molecules(1);
     const int first = molecules.system.getNumParticles();
-    molecules.addParticle(12, Vec3(3, 0, 0));
-    molecules.addParticle(12, Vec3(3, 0.1, 0));
-    molecules.addConstraint(first, first + 1);
-    for (int i = 0; i < 2; i++)
+    for (int i = 0; i <= length; i++) {
+        molecules.addParticle(12, Vec3(3, 0.1 * i, 0.05 * (i % 2)));
+        if (i > 0)
+            molecules.addConstraint(first + i - 1, first + i);
         molecules.velocities[first + i] = Vec3(1, 0, 0);
+    }
     // The wall is reached in the 30th step of 0.001 ps, and pushes in the next one.
     auto* wall = new OpenMM::CustomExternalForce("1e9*x*step(x-3.0295)");
     wall->addParticle(first);
@@ -527,7 +528,7 @@ void testFailureLeavesTheStateBefore(const std::string& precision) {
     ASSERT_EQUAL(0.0, largestDifference(positions[0], positions[1]));
     ASSERT_EQUAL(0.0, largestDifference(velocities[0], velocities[1]));
     // And it goes on from there where there is no wall, which has pushed already.
-    for (int i = first; i < first + 2; i++) {
+    for (int i = first; i <= first + length; i++) {
         positions[1][i] -= Vec3(1, 0, 0);
         velocities[1][i] = Vec3(1, 0, 0);
     }
@@ -591,6 +592,10 @@ int main(int argc, char** argv) {
         {"changed velocities", testChangedVelocities},
         {"a failure leaves the state before, double", [] { testFailureLeavesTheStateBefore("double"); }},
         {"a failure leaves the state before, single", [] { testFailureLeavesTheStateBefore("single"); }},
+        {"a failure of a large cluster leaves the state before, double",
+         [] { testFailureLeavesTheStateBefore("double", 30); }},
+        {"a failure of a large cluster in pieces leaves the state before, mixed",
+         [] { testFailureLeavesTheStateBefore("mixed", 400); }},
         {"what it takes", testWhatItTakes}};
     if (argc > 1)
         tests = {tests.at(std::stoi(argv[1]))};
