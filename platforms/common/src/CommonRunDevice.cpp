@@ -69,6 +69,32 @@ double CommonRunDevice::computeForces() {
     return groupEnergy;
 }
 
+// OpenMM has the inverse masses beside the velocities, and Context::reinitialize() brings old ones back with these.
+void CommonRunDevice::correctMasses() {
+    ContextSelector selector(compute);
+    auto correct = [&](auto& velocities) {
+        compute.getVelm().download(velocities);
+        bool areOthers = false;
+        for (size_t i = 0; i < masses.size(); i++) {
+            auto& inverse = velocities[i].w;
+            const double mass = masses[compute.getAtomIndex()[i]], expected = mass == 0 ? 0.0 : 1 / mass;
+            areOthers = areOthers || std::fabs(inverse - expected) > 1e-6 * expected;
+            if (areOthers)
+                inverse = expected;
+        }
+        if (areOthers)
+            compute.getVelm().upload(velocities);
+    };
+    if (compute.getUseDoublePrecision() || compute.getUseMixedPrecision()) {
+        vector<OpenMM::mm_double4> velocities;
+        correct(velocities);
+    }
+    else {
+        vector<OpenMM::mm_float4> velocities;
+        correct(velocities);
+    }
+}
+
 // Whether the forces are those of the present state. Others may have computed them again, with an energy. A barostat that rejects a
 // move puts forces and the order of the atoms back.
 bool CommonRunDevice::areForcesValid() {
@@ -83,7 +109,7 @@ void CommonRunDevice::ensureForces() {
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
 bool CommonRunDevice::canStepOnDevice() {
-    if (steps == nullptr || settings.isAutomatic || ahead != nullptr || !vrattle.hasStarted())
+    if (steps == nullptr || reach.isUnknown || settings.isAutomatic || ahead != nullptr || !vrattle.hasStarted())
         return false;
     const vector<double> references = vrattle.getReferences();
     return std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
@@ -160,8 +186,6 @@ void CommonRunDevice::stepOnDevice(double maxTime) {
     numAsked++;
     try {
         context.computeVirtualSites();
-        if (reach.isUnknown)
-            vectors->setTime(settledTime + steps->readElapsed());
         vectors->setStepCount(settledCount + numAsked);
         // A state that is to be put back must not have been put into another order.
         if (compute.getStepsSinceReorder() < STEPS_BETWEEN_REORDERINGS || !steps->hasFailed()) {
@@ -243,7 +267,7 @@ void CommonRunDevice::setReferences(const vector<double>& references) {
 
 bool CommonRunDevice::updateState() {
     // What changes positions must not find those of a step that has failed.
-    if (reach.hasBarostat || reach.isUnknown)
+    if (reach.hasBarostat)
         settle();
     try {
         return HostRunDevice::updateState();
@@ -255,19 +279,29 @@ bool CommonRunDevice::updateState() {
 }
 
 RunDevice::Change CommonRunDevice::findChange() {
-    if (ahead != nullptr || vrattle.getPositions().empty())
+    if (!isOnDevice || reach.isUnknown)
         return HostRunDevice::findChange();
     const OpenMM::Vec3* box = vectors->getBoxVectors();
     const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
     std::copy(box, box + 3, boxVectors);
     if (isOtherBox)
         return Change::Box;
-    // Another integrator (of a CompoundIntegrator) has taken steps->
+    // Another integrator (of a CompoundIntegrator) has taken steps.
     if (vectors->getStepCount() != knownCount)
         return Change::State;
     // A uniform motion is of no concern to constraints and their forces.
     const bool doesFrameMatter = reach.movesFrame && StepProgram::usesSpeeds(settings.terms);
-    return reach.isUnknown || reach.hasThermostat || doesFrameMatter ? Change::Velocities : Change::None;
+    return reach.hasThermostat || doesFrameMatter ? Change::Velocities : Change::None;
+}
+
+// The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
+bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) const {
+    const double tolerance = compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
+    for (size_t i = 0; i < masses.size(); i++)
+        for (int d = 0; d < 3; d++)
+            if (masses[i] > 0 && !(std::fabs(a[i][d] - b[i][d]) <= tolerance * std::max(1.0, std::fabs(a[i][d]))))
+                return true;
+    return false;
 }
 
 unsigned long long CommonRunDevice::getFingerprint() {
@@ -280,6 +314,7 @@ void CommonRunDevice::start() {
     isOnDevice = false;
     isOnHost = true;
     hasForces = false;
+    correctMasses();
     HostRunDevice::start();
     knownCount = vectors->getStepCount();
 }
@@ -404,6 +439,7 @@ void CommonRunDevice::save(RunState& run) {
 bool CommonRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     settle();
     hasForces = false;
+    correctMasses();
     if (!HostRunDevice::resume(run, saved, areForcesOthers))
         return false;
     isOnDevice = false;

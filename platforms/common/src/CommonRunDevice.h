@@ -49,9 +49,11 @@ public:
 
 protected:
     double computeForces() override;
+    bool differ(const Vectors& a, const Vectors& b) const override;
 
 private:
     bool canStepOnDevice();
+    void correctMasses();
     bool areForcesValid();
     void ensureForces();
     int getNumWrites() const;

@@ -12,8 +12,9 @@ using std::vector;
 
 namespace {
 
-// Of a density for (3.14); those that are not needed cost a launch that returns at once.
-const int NUM_TRIALS = 6;
+// Of a density for (3.14). Those that are not needed cost a launch that returns at once; where they do not suffice the host takes the
+// step. So there is one more than were needed of late.
+const int FEWEST_TRIALS = 3, MOST_TRIALS = 6;
 // Stands for no limit of a step, in single precision too (ps).
 const double NO_LIMIT = 1e30;
 // A step that is none: the state was changed by others.
@@ -57,7 +58,7 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& cl
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
         isWide(context.getSupportsDoublePrecision()), groupSize(StepProgram::getGroupSize(!large.isEmpty())),
         numGroups(0), numPartials(0), numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0),
-        groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
+        numTrials(MOST_TRIALS), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
@@ -180,6 +181,7 @@ void DeviceSteps::compile(StepProgram::Update update) {
     resize(settingsArray, Control::FirstTerm + 3 * settings.terms.size(), wideSize, "vrattleSettings");
     for (OpenMM::ComputeArray& array : control)
         resize(array, Control::FirstValue + settings.terms.size(), wideSize, "vrattleControl");
+    resize(reportArray, Control::FirstValue + settings.terms.size() + 2, wideSize, "vrattleReport");
     resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numPartials, mixedSize, "vrattlePartials");
     for (OpenMM::ComputeArray& array : trialPartials)
         resize(array, numSums * numPartials, mixedSize, "vrattleTrialPartials");
@@ -245,6 +247,7 @@ void DeviceSteps::setArguments(Kernels& created) {
     created.evaluate->addArg(settingsArray);
     created.evaluate->addArg(partials);
     created.evaluate->addArg(failure);
+    created.evaluate->addArg(reportArray);
 
     if (created.trial) {
         addEmpty(created.trial, 6); // step, index, groupEnergy, tolerance, numPartials, control
@@ -257,8 +260,7 @@ void DeviceSteps::setArguments(Kernels& created) {
     addEmpty(created.advance, 7); // step, groupEnergy, maxStep, tolerance, numPartials, control, nextControl
     created.advance->addArg(settingsArray);
     created.advance->addArg(partials);
-    created.advance->addArg(trials[NUM_TRIALS % 2]);
-    created.advance->addArg(trialPartials[NUM_TRIALS % 2]);
+    addEmpty(created.advance, 2); // the last trial and its sums
     created.advance->addArg(oldPositions);
     created.advance->addArg(oldVelocities);
     created.advance->addArg(iterationCounts);
@@ -426,9 +428,9 @@ bool DeviceSteps::change(double energy) {
 
 // Of a change; such a failure leaves nothing to put back.
 bool DeviceSteps::hasChangeFailed() {
-    vector<int> codes;
-    failure.download(codes);
-    if (codes[0] == 0)
+    vector<double> block;
+    reportArray.download(block, true);
+    if (block[block.size() - 2] < 0)
         return false;
     failure.upload(vector<int>{0, 0});
     return true;
@@ -438,7 +440,7 @@ void DeviceSteps::advance(double maxStep) {
     OpenMM::ContextSelector selector(context);
     stepNumber++;
     if (kernels.trial)
-        for (int i = 0; i < NUM_TRIALS; i++) {
+        for (int i = 0; i < numTrials; i++) {
             kernels.trial->setArg(0, stepNumber);
             kernels.trial->setArg(1, i);
             setWide(kernels.trial, 2, groupEnergy);
@@ -464,6 +466,8 @@ void DeviceSteps::advance(double maxStep) {
     kernels.advance->setArg(4, numPartials);
     kernels.advance->setArg(5, control[half]);
     kernels.advance->setArg(6, control[1 - half]);
+    kernels.advance->setArg(9, trials[numTrials % 2]);
+    kernels.advance->setArg(10, trialPartials[numTrials % 2]);
     launch(kernels.advance, 24);
     half = 1 - half;
     if (kernels.advanceLarge) {
@@ -482,64 +486,64 @@ void DeviceSteps::finish(double energy) {
 DeviceSteps::Report DeviceSteps::read() {
     OpenMM::ContextSelector selector(context);
     launchEvaluate(stepNumber, false);
-    return readAndUndo(0);
+    vector<double> block;
+    reportArray.download(block, true);
+    const int stepsSinceFailure = (int) std::lround(block[block.size() - 2]), code = (int) std::lround(block.back());
+    numTrials = std::min(MOST_TRIALS, std::max(FEWEST_TRIALS, (int) block[Control::MostTrials] + 1));
+    if (stepsSinceFailure < 0)
+        return fill(block);
+    // The sums are those of the state put back, unless its step got as far as to leave others.
+    const bool hasSums = code == Control::NotConverged || code == Control::UnsolvedDensity;
+    if (code == Control::UnsolvedDensity)
+        numTrials = MOST_TRIALS;
+    Report report = undo(stepsSinceFailure + 1, hasSums);
+    report.hasFailed = true;
+    return report;
 }
 
 DeviceSteps::Report DeviceSteps::putBack() {
     OpenMM::ContextSelector selector(context);
-    return readAndUndo(1);
-}
-
-// Undo the last steps, or those since one that has failed.
-DeviceSteps::Report DeviceSteps::readAndUndo(int numSteps) {
-    Report report = {};
     vector<int> codes;
     failure.download(codes);
-    report.hasFailed = codes[0] != 0;
+    if (codes[0] == 0)
+        return undo(1, true);
     const int code = codes[1] % Control::NumCodes;
-    if (report.hasFailed)
-        numSteps = stepNumber - codes[0] + 1;
-    if (numSteps > 0)
-        undo(numSteps);
-    // The sums are those of the state put back, unless its step got as far as to leave others.
-    bool hasSums = !report.hasFailed || code == Control::NotConverged || code == Control::UnsolvedDensity;
-    if (numSteps > 0 && hasSums)
-        launchEvaluate(NO_STEP, false);
-    fill(report);
-    report.state.hasHalfStepValue = report.state.hasHalfStepValue && hasSums;
+    Report report = undo(stepNumber - codes[0] + 1, code == Control::NotConverged || code == Control::UnsolvedDensity);
+    report.hasFailed = true;
     return report;
 }
 
 // Put back the state before the last steps, of which the first is the one whose copy there is: the others have done nothing.
-void DeviceSteps::undo(int numSteps) {
+DeviceSteps::Report DeviceSteps::undo(int numSteps, bool hasSums) {
     kernels.restore->execute(context.getNumAtoms());
     if (numSteps % 2 == 1)
         half = 1 - half;
     failure.upload(vector<int>{0, 0});
-}
-
-void DeviceSteps::fill(Report& report) {
+    if (hasSums)
+        launchEvaluate(NO_STEP, false);
     vector<double> block;
     control[half].download(block, true);
+    Report report = fill(block);
+    report.state.hasHalfStepValue = report.state.hasHalfStepValue && hasSums;
+    return report;
+}
+
+DeviceSteps::Report DeviceSteps::fill(const vector<double>& block) {
+    Report report = {};
     report.state = {block[Control::Density], block[Control::DensityOffset], program->hasHalfSums(),
                     block[Control::HalfU]};
     report.isShortened = block[Control::IsShortened] != 0;
     report.stepSize = block[Control::StepSize];
     report.u = block[Control::U];
-    report.values.assign(block.begin() + Control::FirstValue, block.end());
+    report.values.assign(block.begin() + Control::FirstValue,
+                         block.begin() + Control::FirstValue + settings.terms.size());
     report.elapsed = block[Control::Elapsed] - elapsedRead;
     report.numSteps = (int) std::lround(block[Control::Steps] - numStepsRead);
     report.numRescues = (int) std::lround(block[Control::Rescues] - numRescuesRead);
     elapsedRead = block[Control::Elapsed];
     numStepsRead = block[Control::Steps];
     numRescuesRead = block[Control::Rescues];
-}
-
-double DeviceSteps::readElapsed() {
-    OpenMM::ContextSelector selector(context);
-    vector<double> block;
-    control[half].download(block, true);
-    return block[Control::Elapsed] - elapsedRead;
+    return report;
 }
 
 bool DeviceSteps::hasFailed() {

@@ -80,8 +80,7 @@ public:
     Report read();
     /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
     Report putBack();
-    /** The time since the last read(), the last advance() included; and whether a step has failed. Both wait for the device. */
-    double readElapsed();
+    /** Whether a step has failed. Waits for the device. */
     bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
     long long getNumIterations();
@@ -114,9 +113,8 @@ private:
     void launchFinish(int step, double kick, bool isFormed, bool isStored);
     void launchEvaluate(int step, bool isRescaled);
     bool hasChangeFailed();
-    Report readAndUndo(int numSteps);
-    void undo(int numSteps);
-    void fill(Report& report);
+    Report undo(int numSteps, bool hasSums);
+    Report fill(const std::vector<double>& block);
     OpenMM::ComputeContext& context;
     std::vector<ClusterKind> kinds;
     LargeClusters large;
@@ -131,9 +129,11 @@ private:
     long long numLaunches;
     int half;       // the control block that is in force
     int stepNumber; // of the last advance()
+    int numTrials;  // launches for a density
     double groupEnergy;
     double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
-    OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2];
+    OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2],
+        reportArray;
     OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts;
     OpenMM::ComputeArray largeTables, largePieces, largeRows, largeRowLengths, largeAtoms, largeJoints,
         largeJointLengths;

@@ -156,6 +156,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"DENSITY_OFFSET", Control::DensityOffset},
                                       {"MISMATCH_SLOPE", Control::MismatchSlope},
                                       {"IS_SHORTENED", Control::IsShortened},
+                                      {"MOST_TRIALS", Control::MostTrials},
                                       {"FIRST_VALUE", Control::FirstValue},
                                       {"CONTROL_SIZE", Control::FirstValue + (int) terms.size()},
                                       {"NOMINAL", Control::Nominal},

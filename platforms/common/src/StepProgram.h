@@ -30,6 +30,7 @@ enum Field {
     DensityOffset, // what (3.14) and (3.15) differed by in the last step
     MismatchSlope, // of (3.14) as a function of the density, in the last step
     IsShortened,   // the last step was cut short
+    MostTrials,    // of a density, since the host has looked last
     FirstValue     // U_k
 };
 /** The settings; the weight, the power and the reference value of each monitor follow. */

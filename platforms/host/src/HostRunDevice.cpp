@@ -143,11 +143,13 @@ RunDevice::Change HostRunDevice::findChange() {
 unsigned long long HostRunDevice::getFingerprint() {
     const Vectors &positions = vectors->getPositions(), &velocities = vectors->getVelocities();
     Fingerprint fingerprint;
+    // In the digits that every platform keeps, so that it knows a state again that comes from another one.
     for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] > 0) {
-            fingerprint.add(positions[i]);
-            fingerprint.add(velocities[i]);
-        }
+        if (masses[i] > 0)
+            for (int d = 0; d < 3; d++) {
+                fingerprint.add((double) (float) positions[i][d]);
+                fingerprint.add((double) (float) velocities[i][d]);
+            }
     for (int i = 0; i < 3; i++)
         fingerprint.add(vectors->getBoxVectors()[i]);
     return fingerprint.get();

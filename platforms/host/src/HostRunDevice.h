@@ -79,7 +79,8 @@ protected:
     void putBack();
     const Vectors& knownPositions() const;
     const Vectors& knownVelocities() const;
-    bool differ(const Vectors& a, const Vectors& b) const;
+    /** Whether two sets of positions or velocities are others, for the particles that move. */
+    virtual bool differ(const Vectors& a, const Vectors& b) const;
     void writeMovingPositions(const Vectors& positions);
     void writeMovingVelocities(const Vectors& velocities);
     void copyMoving(const Vectors& from, Vectors& to) const;

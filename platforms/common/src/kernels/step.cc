@@ -259,10 +259,11 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
 
 /**
  * Evaluate the monitors at the on-step state, for the host to read; of one work group. With isRescaled, after a jump of the state,
- * the density keeps its ratio to u. A monitor that is no number makes the step that has led here fail.
+ * the density keeps its ratio to u. A monitor that is no number makes the step that has led here fail. The report is the control
+ * block and behind it how many steps ago one has failed (-1 for none) and why.
  */
 KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
-        GLOBAL const mixed* RESTRICT partials, GLOBAL int* RESTRICT failure) {
+        GLOBAL const mixed* RESTRICT partials, GLOBAL int* RESTRICT failure, GLOBAL wide* RESTRICT report) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     wide values[NUM_VALUES];
@@ -287,6 +288,13 @@ KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPar
                 control[FIRST_VALUE + k] = values[k];
         }
     }
+    if (LOCAL_ID == 0) {
+        for (int i = 0; i < CONTROL_SIZE; i++)
+            report[i] = control[i];
+        report[CONTROL_SIZE] = (failure[0] != 0 ? step - failure[0] : -1);
+        report[CONTROL_SIZE + 1] = failure[1] % NUM_CODES;
+        control[MOST_TRIALS] = 0;
+    }
 }
 
 #if HALF_SUMS
@@ -302,8 +310,8 @@ inline DEVICE bool judgeTrial(wide uTrial, wide* trial, GLOBAL const wide* RESTR
     const wide secant = (trial[TRIAL_COUNT] > 0 && fabs(change) > (wide) SLOPE_ROUNDING*rho ? (mismatch - last)/change : (wide) 0);
     if (secant > (wide) 0.1f && secant < 10)
         trial[TRIAL_SLOPE] = secant;
-    // What the next density will leave: each secant step gains more than the one before.
-    const wide left = (trial[TRIAL_COUNT] > 1 ? fabs(mismatch*(mismatch/last)) : fabs(mismatch));
+    // What the next density will leave: a secant step gains as much again, as far as the mismatch is straight on that scale.
+    const wide left = fabs(mismatch)*(trial[TRIAL_COUNT] > 0 ? max(fabs(mismatch/last), fabs(last)/rho) : (wide) 1);
     const wide tolerance = settings[DENSITY_TOLERANCE]*(rho + trial[TRIAL_PREVIOUS]);
     trial[TRIAL_LAST_DENSITY] = rho;
     trial[TRIAL_LAST_MISMATCH] = mismatch;
@@ -331,9 +339,11 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
     LOCAL wide shared[2];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     const bool isFrozen = IS_FROZEN(failure, step);
-    gatherSums(numPartials, index == 0 ? partials : lastPartials, sums, buffer);
+    // What is of no use is not read: the sums of half steps after the first trial, and none once the density is found.
+    const bool isFirst = (index == 0), isOver = (!isFirst && lastTrial[TRIAL_STATUS] != TRYING);
+    gatherSums(isOver ? 0 : numPartials, isFirst ? partials : lastPartials, sums, buffer);
     SYNC_THREADS;
-    gatherSums(numPartials, partials + NUM_SUMS*numPartials, halfSums, buffer);
+    gatherSums(isFirst ? numPartials : 0, partials + NUM_SUMS*numPartials, halfSums, buffer);
     if (LOCAL_ID == 0) {
         wide trial[TRIAL_SIZE], values[NUM_VALUES];
         for (int i = 0; i < TRIAL_SIZE; i++)
@@ -411,6 +421,7 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         const bool isSolved = (trial[TRIAL_STATUS] == CONVERGED);
         wide rho = (isSolved ? trial[TRIAL_DENSITY] : (wide) 1);
         now[MISMATCH_SLOPE] = trial[TRIAL_SLOPE];
+        now[MOST_TRIALS] = max(now[MOST_TRIALS], trial[TRIAL_COUNT]);
 #else
         const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
         const bool isSolved = true;
