@@ -28,10 +28,10 @@ if [ -n "$tests" ]; then
 import pathlib, openmm.version, openmmvrattle
 libraries = pathlib.Path(openmm.version.openmm_library_path)
 print(libraries, libraries / "plugins", pathlib.Path(openmmvrattle.__file__).parent / "lib")' 2>/dev/null | tail -n 1)
-    export OPENMM_PLUGIN_DIR=$plugins LD_LIBRARY_PATH="$ours:$libraries:$plugins:${LD_LIBRARY_PATH:-}"
+    export OPENMM_PLUGIN_DIR=$plugins LD_LIBRARY_PATH="$ours:$ours/plugins:$libraries:$plugins:${LD_LIBRARY_PATH:-}"
     end=$((SECONDS + test_seconds))
     for precision in ${PRECISIONS:-double mixed single}; do
-        for name in VariableStepRattleIntegrator VariableStepRattleBehaviours Serialization MovingParameters Failures \
+        for name in Agreement VariableStepRattleIntegrator VariableStepRattleBehaviours Serialization MovingParameters Failures \
             ExpressionConstraints Checks; do
             name=Test${name}GPU
             left=$((end - SECONDS < 45 ? end - SECONDS : 45))

@@ -295,8 +295,12 @@ RunDevice::Change CommonRunDevice::findChange() {
 }
 
 // The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
+double CommonRunDevice::getPositionRounding() const {
+    return compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
+}
+
 bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) const {
-    const double tolerance = compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
+    const double tolerance = getPositionRounding();
     for (size_t i = 0; i < masses.size(); i++)
         for (int d = 0; d < 3; d++)
             if (masses[i] > 0 && !(std::fabs(a[i][d] - b[i][d]) <= tolerance * std::max(1.0, std::fabs(a[i][d]))))

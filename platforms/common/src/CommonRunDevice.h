@@ -49,6 +49,7 @@ public:
 
 protected:
     double computeForces() override;
+    double getPositionRounding() const override;
     bool differ(const Vectors& a, const Vectors& b) const override;
 
 private:

@@ -4,6 +4,7 @@
 // The tests of `tests` on a GPU platform. The program's arguments are its name, our library for it and a precision; then perhaps
 // the number of one test.
 
+#include "ReferenceVRattleKernelFactory.h"
 #include "TestSupport.h"
 #include "openmm/Platform.h"
 
@@ -25,6 +26,7 @@ inline int runOnPlatform(const TestList& tests, int argc, char** argv) {
     }
     testPlatformName() = argv[1];
     OpenMM::Platform::loadPluginsFromDirectory(OpenMM::Platform::getDefaultPluginsDirectory());
+    registerVRattleReferenceKernelFactories(); // to compare with
     OpenMM::Platform::loadPluginLibrary(argv[2]);
     getTestPlatform().setPropertyDefaultValue("Precision", argv[3]);
     TestList chosen = tests;

@@ -13,6 +13,7 @@
 #include <atomic>
 #include <cmath>
 #include <limits>
+#include <random>
 
 using namespace OpenMMVRattle;
 using OpenMM::ContextImpl;
@@ -23,7 +24,7 @@ using std::vector;
 
 namespace {
 
-const int NO_MONITOR_GROUP = -1;
+const int NO_MONITOR_GROUP = -1, NUM_POSITION_SUMS = 8;
 // Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
 const double FORCE_ROUNDING = 1e-4;
 
@@ -141,18 +142,31 @@ RunDevice::Change HostRunDevice::findChange() {
 }
 
 unsigned long long HostRunDevice::getFingerprint() {
-    const Vectors &positions = vectors->getPositions(), &velocities = vectors->getVelocities();
+    const Vectors& velocities = vectors->getVelocities();
     Fingerprint fingerprint;
-    // In the digits that every platform keeps, so that it knows a state again that comes from another one.
+    // In the digits that every platform keeps, so that it knows a state again that comes from another one. Positions change by rounding
+    // where they are wrapped into the box; resume() compares them.
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0)
-            for (int d = 0; d < 3; d++) {
-                fingerprint.add((double) (float) positions[i][d]);
+            for (int d = 0; d < 3; d++)
                 fingerprint.add((double) (float) velocities[i][d]);
-            }
     for (int i = 0; i < 3; i++)
         fingerprint.add(vectors->getBoxVectors()[i]);
     return fingerprint.get();
+}
+
+// Some sums of all positions with signs by chance, the same everywhere: whoever moves particles changes them.
+vector<double> HostRunDevice::sumPositions() {
+    vector<double> sums(NUM_POSITION_SUMS, 0.0);
+    std::minstd_rand random;
+    const Vectors& positions = vectors->getPositions();
+    for (size_t i = 0; i < masses.size(); i++)
+        for (int d = 0; d < 3; d++) {
+            const unsigned signs = (unsigned) random() >> 8;
+            for (int k = 0; k < NUM_POSITION_SUMS && masses[i] > 0; k++)
+                sums[k] += (signs >> k & 1) != 0 ? positions[i][d] : -positions[i][d];
+        }
+    return sums;
 }
 
 unsigned long long HostRunDevice::getParameterFingerprint() {
@@ -401,6 +415,7 @@ long long HostRunDevice::getNumSolverIterations() {
 
 void HostRunDevice::save(RunState& run) {
     saveDynamics(run);
+    run.methodValues["positionSums"] = sumPositions();
     run.forces = dynamics->getForces();
     run.groupEnergy = dynamics->getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
@@ -416,6 +431,11 @@ void HostRunDevice::save(RunState& run) {
 }
 
 bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
+    const vector<double> sums = sumPositions(), &savedSums = run.getMethodValues("positionSums", NUM_POSITION_SUMS);
+    const double largest = 4 * getPositionRounding() * std::sqrt(3.0 * masses.size());
+    for (int k = 0; k < NUM_POSITION_SUMS; k++)
+        if (!(std::fabs(sums[k] - savedSums[k]) <= largest))
+            return false;
     const Vectors& positions = run.positions.empty() ? vectors->getPositions() : run.positions;
     const Vectors& velocities = run.velocities.empty() ? vectors->getVelocities() : run.velocities;
     Vectors forces = run.forces;

@@ -79,6 +79,11 @@ protected:
     void putBack();
     const Vectors& knownPositions() const;
     const Vectors& knownVelocities() const;
+    /** How far a position that is loaded may be from the one that was saved (nm). */
+    virtual double getPositionRounding() const {
+        return 0;
+    }
+    std::vector<double> sumPositions();
     /** Whether two sets of positions or velocities are others, for the particles that move. */
     virtual bool differ(const Vectors& a, const Vectors& b) const;
     void writeMovingPositions(const Vectors& positions);

@@ -1,0 +1,305 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// A GPU against Reference, from one state in the middle of a run; and what happens between steps there.
+
+#include "GpuTests.h"
+
+#include "TestVariableStepRattleIntegrator.h"
+#include "openmm/CompoundIntegrator.h"
+#include "openmm/MonteCarloBarostat.h"
+#include "openmm/serialization/XmlSerializer.h"
+
+using namespace OpenMMVRattle;
+
+namespace {
+
+const int WHOLE_STATE = State::Positions | State::Velocities | State::Parameters | State::IntegratorParameters;
+
+std::string precision() {
+    return getTestPlatform().getPropertyDefaultValue("Precision");
+}
+
+// One of three numbers, for double, mixed and single precision.
+double choose(double inDouble, double inMixed, double inSingle) {
+    return precision() == "double" ? inDouble : precision() == "mixed" ? inMixed : inSingle;
+}
+
+// The bounds are those of OpenMM's nonbonded forces, which differ by 3e-7 between Reference and OpenCL in double precision;
+// TestDeviceSteps compares the method itself.
+
+// Water, a massless wall particle and a site in a triclinic box, in which molecules that leave it are wrapped.
+struct Box : TestSystem {
+    explicit Box(int waters, bool isBarostatted = false) {
+        const double edge = 2.4;
+        system.setDefaultPeriodicBoxVectors(Vec3(edge, 0, 0), Vec3(0.3, edge, 0), Vec3(-0.2, 0.4, edge));
+        auto* nonbonded = new NonbondedForce();
+        nonbonded->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
+        nonbonded->setCutoffDistance(0.9);
+        nonbonded->setUseSwitchingFunction(true);
+        nonbonded->setSwitchingDistance(0.7);
+        std::mt19937 random(11);
+        std::normal_distribution<double> normal;
+        const double charges[] = {-0.834, 0.417, 0.417};
+        for (int i = 0; i < waters; i++) {
+            const int first = system.getNumParticles();
+            const Vec3 centre(edge / 4 * (i % 4) + 0.05, edge / 4 * (i / 4 % 4), edge / 4 * (i / 16) - 0.02);
+            for (int j = 0; j < 3; j++) {
+                const double mass = j == 0 ? 16.0 : 1.0;
+                system.addParticle(mass);
+                nonbonded->addParticle(charges[j], j == 0 ? 0.3125 : 1.0, j == 0 ? 0.5625 : 0.0);
+                velocities.push_back(Vec3(normal(random), normal(random), normal(random)) * std::sqrt(2.5 / mass));
+            }
+            positions.push_back(centre);
+            positions.push_back(centre + Vec3(0.0957, 0, 0));
+            positions.push_back(centre + Vec3(-0.024, 0.0927, 0));
+            for (const auto& bond : {std::pair<int, int>{0, 1}, {0, 2}, {1, 2}}) {
+                const Vec3 r = positions[first + bond.first] - positions[first + bond.second];
+                system.addConstraint(first + bond.first, first + bond.second, std::sqrt(r.dot(r)));
+                nonbonded->addException(first + bond.first, first + bond.second, 0, 1, 0);
+            }
+        }
+        const int site = system.addParticle(0), fixed = system.addParticle(0);
+        system.setVirtualSite(site, new TwoParticleAverageSite(0, 4, 0.3, 0.7));
+        nonbonded->addParticle(0.1, 1, 0);
+        nonbonded->addParticle(-0.1, 0.25, 0.25);
+        for (int i : {0, 1, 2, 3, 4, 5})
+            nonbonded->addException(i, site, 0, 1, 0);
+        positions.push_back(Vec3());
+        positions.push_back(Vec3(1.2, 1.1, 2.25));
+        velocities.resize(fixed + 1);
+        system.addForce(nonbonded);
+        if (isBarostatted) {
+            auto* barostat = new MonteCarloBarostat(1.0, 300.0, 4);
+            barostat->setRandomNumberSeed(3);
+            system.addForce(barostat);
+        }
+    }
+};
+
+struct On {
+    Integrator_ integrator;
+    Context context;
+    On(const TestSystem& t, Platform& platform) : integrator(0.001), context(t.system, integrator, platform) {
+    }
+    vector<Vec3> positions() {
+        return context.getState(State::Positions).getPositions();
+    }
+};
+
+Platform& reference() {
+    return Platform::getPlatform("Reference");
+}
+
+// The state of a run on Reference after some steps, as XML.
+std::string stateInMidRun(const TestSystem& t, Integrator_::UpdateMethod update) {
+    On run(t, reference());
+    run.integrator.setUpdateMethod(update);
+    run.integrator.addMonitor(Integrator_::AppliedForce);
+    run.integrator.setConstraintTolerance(1e-10);
+    run.context.setPositions(t.positions);
+    run.context.setVelocities(t.velocities);
+    run.integrator.step(20);
+    const State state = run.context.getState(WHOLE_STATE);
+    std::stringstream text;
+    XmlSerializer::serialize<State>(&state, "State", text);
+    return text.str();
+}
+
+void load(Context& context, const std::string& xml) {
+    std::stringstream text(xml);
+    std::unique_ptr<State> state(XmlSerializer::deserialize<State>(text));
+    context.setState(*state);
+}
+
+std::string save(Context& context) {
+    const State state = context.getState(WHOLE_STATE);
+    std::stringstream text;
+    XmlSerializer::serialize<State>(&state, "State", text);
+    return text.str();
+}
+
+double largestOf(const vector<double>& values) {
+    double largest = 0;
+    for (double value : values)
+        largest = std::max(largest, std::fabs(value));
+    return largest;
+}
+
+void testAgreement() {
+    const Box t(48);
+    for (auto update : {Integrator_::SemiExplicit, Integrator_::Explicit, Integrator_::Bounded}) {
+        const std::string xml = stateInMidRun(t, update);
+        On here(t, getTestPlatform()), there(t, reference());
+        load(here.context, xml);
+        load(there.context, xml);
+        const double density = there.integrator.getStepDensity();
+        ASSERT_EQUAL_TOL(density, here.integrator.getStepDensity(), 1e-12);
+        for (int steps : {1, 199}) {
+            here.integrator.step(steps);
+            there.integrator.step(steps);
+            // Chaos multiplies the rounding of forces a thousandfold in so many steps, and hides it in single precision.
+            const double bound = steps == 1 ? choose(1e-9, 1e-6, 1e-5) : choose(1e-5, 1e-3, 1e-1);
+            ASSERT(largestDifference(there.positions(), here.positions()) <= bound);
+            ASSERT_EQUAL_TOL(there.integrator.getStepDensity(), here.integrator.getStepDensity(),
+                             choose(1e-4, 1e-2, 1e-1));
+            ASSERT_EQUAL_TOL(there.context.getTime(), here.context.getTime(), choose(1e-7, 1e-4, 1e-3));
+            if (steps == 1) {
+                vector<double> expected = there.integrator.getMultipliers(), found = here.integrator.getMultipliers();
+                const double scale = largestOf(expected);
+                for (size_t k = 0; k < expected.size(); k++)
+                    ASSERT(std::fabs(found[k] - expected[k]) <= choose(1e-7, 1e-5, 1e-4) * scale);
+            }
+        }
+        ASSERT_EQUAL(there.context.getStepCount(), here.context.getStepCount());
+        ASSERT_EQUAL(there.integrator.getNumForceEvaluations(), here.integrator.getNumForceEvaluations());
+        ASSERT(largestConstraintError(here.context) <= choose(1e-9, 1e-7, 1e-4));
+    }
+}
+
+// A State goes from Reference to the GPU, on, and back, and the run goes on all the way: no start gives its density away.
+void testStatesMove() {
+    const Box t(27);
+    const std::string xml = stateInMidRun(t, Integrator_::SemiExplicit);
+    On first(t, reference()), second(t, getTestPlatform()), third(t, reference()), fourth(t, getTestPlatform()),
+        all(t, reference());
+    load(all.context, xml);
+    all.integrator.step(20);
+    load(second.context, xml);
+    second.integrator.step(5);
+    load(third.context, save(second.context));
+    third.integrator.step(5);
+    load(fourth.context, save(third.context));
+    fourth.integrator.step(5);
+    load(first.context, save(fourth.context));
+    first.integrator.step(5);
+    // Each went on with the one evaluation that compares forces, and one a step.
+    for (On* each : {&first, &second, &third, &fourth})
+        ASSERT_EQUAL(6, each->integrator.getNumForceEvaluations());
+    ASSERT(largestDifference(all.positions(), first.positions()) <= choose(1e-8, 1e-5, 1e-4));
+    ASSERT_EQUAL_TOL(all.integrator.getStepDensity(), first.integrator.getStepDensity(), choose(1e-7, 1e-4, 1e-2));
+    ASSERT_EQUAL_TOL(all.context.getTime(), first.context.getTime(), choose(1e-9, 1e-6, 1e-4));
+}
+
+void testReversal() {
+    Box t(27);
+    On run(t, getTestPlatform());
+    run.integrator.setConstraintTolerance(choose(1e-13, 1e-12, 1e-5));
+    run.context.setPositions(t.positions);
+    run.context.setVelocities(t.velocities);
+    run.integrator.step(20);
+    const vector<Vec3> there = run.positions();
+    run.integrator.step(100);
+    run.integrator.reverse();
+    run.integrator.step(100);
+    ASSERT(largestDifference(there, run.positions()) <= choose(1e-11, 1e-5, 1e-3));
+}
+
+// Energies asked for between steps cost no evaluation of ours and change nothing.
+void testEnergiesInBetween() {
+    const Box t(27);
+    On often(t, getTestPlatform()), once(t, getTestPlatform());
+    for (On* each : {&often, &once}) {
+        each->context.setPositions(t.positions);
+        each->context.setVelocities(t.velocities);
+        each->integrator.step(1);
+    }
+    for (int i = 0; i < 30; i++) {
+        totalEnergy(often.context);
+        often.integrator.step(1);
+    }
+    once.integrator.step(30);
+    ASSERT_EQUAL(once.integrator.getNumForceEvaluations(), often.integrator.getNumForceEvaluations());
+    ASSERT(largestDifference(once.positions(), often.positions()) <= choose(1e-12, 1e-6, 1e-4));
+}
+
+// A barostat changes the state by itself; the constraints hold, and rejected moves leave no trace.
+void testBarostat() {
+    const Box t(27, true);
+    On run(t, getTestPlatform());
+    run.integrator.setConstraintTolerance(choose(1e-10, 1e-8, 1e-5));
+    run.context.setPositions(t.positions);
+    run.context.setVelocities(t.velocities);
+    Vec3 box[3];
+    run.context.getState(State::Positions).getPeriodicBoxVectors(box[0], box[1], box[2]);
+    const double before = box[0][0];
+    for (int i = 0; i < 10; i++) {
+        run.integrator.step(10);
+        ASSERT(largestConstraintError(run.context) <= choose(2e-10, 1e-6, 1e-4));
+        ASSERT(std::isfinite(totalEnergy(run.context)));
+    }
+    run.context.getState(State::Positions).getPeriodicBoxVectors(box[0], box[1], box[2]);
+    ASSERT(box[0][0] != before);
+    ASSERT_EQUAL(100, run.context.getStepCount());
+    ASSERT(run.integrator.getNumForceEvaluations() >= 101);
+    ASSERT(run.integrator.getNumForceEvaluations() <= 101 + 25); // one for each accepted move at most
+}
+
+// A dumbbell beside others flies into a wall that no step can take, in step 31 of 60.
+void testFailureInTheMiddle() {
+    TestSystem t;
+    for (int i = 0; i < 20; i++) {
+        t.system.addParticle(12);
+        t.positions.push_back(Vec3(1 + 0.3 * (i / 2), 0.1 * (i % 2), 0));
+        t.velocities.push_back(Vec3(1, 0, 0));
+        if (i % 2 == 1)
+            t.system.addConstraint(i - 1, i, 0.1);
+    }
+    auto* wall = new CustomExternalForce("1e9*x*step(x-1.0295)");
+    wall->addParticle(0);
+    t.system.addForce(wall);
+    std::string messages[2];
+    for (int k = 0; k < 2; k++) {
+        On run(t, k == 0 ? reference() : getTestPlatform()), stopped(t, k == 0 ? reference() : getTestPlatform());
+        for (On* each : {&run, &stopped}) {
+            each->integrator.clearMonitors();
+            each->integrator.setConstraintTolerance(1e-5);
+            each->context.setPositions(t.positions);
+            each->context.setVelocities(t.velocities);
+        }
+        stopped.integrator.step(30);
+        try {
+            run.integrator.step(60);
+        }
+        catch (const std::exception& e) {
+            messages[k] = e.what();
+        }
+        ASSERT_EQUAL(30, run.context.getStepCount());
+        ASSERT_EQUAL_TOL(0.030, run.context.getTime(), choose(1e-12, 1e-12, 1e-6));
+        ASSERT_EQUAL_TOL(0.001, run.integrator.getStepSize(), choose(1e-12, 1e-12, 1e-6));
+        const double rounding = choose(1e-12, 1e-12, 1e-6);
+        ASSERT(largestDifference(stopped.positions(), run.positions()) <= rounding);
+        ASSERT(largestDifference(stopped.context.getState(State::Velocities).getVelocities(),
+                                 run.context.getState(State::Velocities).getVelocities()) <= rounding);
+        // And it goes on where there is no wall.
+        vector<Vec3> elsewhere = run.positions();
+        elsewhere[0] -= Vec3(0.5, 0, 0);
+        elsewhere[1] -= Vec3(0.5, 0, 0);
+        run.context.setPositions(elsewhere);
+        run.context.setVelocities(t.velocities);
+        run.integrator.step(5);
+        ASSERT_EQUAL(35, run.context.getStepCount());
+    }
+    ASSERT(!messages[0].empty());
+    // The numbers in it may differ by rounding.
+    const auto withoutNumbers = [](const std::string& text) {
+        std::string result;
+        for (char c : text)
+            if (!std::isdigit(c) && c != '.' && c != '-' && c != '+' && c != 'e')
+                result += c;
+        return result;
+    };
+    ASSERT_EQUAL(withoutNumbers(messages[0]), withoutNumbers(messages[1]));
+}
+
+} // namespace
+
+int main(int argc, char** argv) {
+    return runOnPlatform({{"agreement with Reference", testAgreement},
+                          {"States move between platforms", testStatesMove},
+                          {"reversal", testReversal},
+                          {"energies in between", testEnergiesInBetween},
+                          {"a barostat", testBarostat},
+                          {"a failure in the middle of a block", testFailureInTheMiddle}},
+                         argc, argv);
+}
