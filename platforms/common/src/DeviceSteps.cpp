@@ -489,7 +489,10 @@ DeviceSteps::Report DeviceSteps::read() {
     vector<double> block;
     reportArray.download(block, true);
     const int stepsSinceFailure = (int) std::lround(block[block.size() - 2]), code = (int) std::lround(block.back());
-    numTrials = std::min(MOST_TRIALS, std::max(FEWEST_TRIALS, (int) block[Control::MostTrials] + 1));
+    // (The monitors of large clusters, whose factors are in single precision, scatter by more, and take what there is.)
+    if (large.isEmpty())
+        numTrials =
+            std::min(MOST_TRIALS, std::max({FEWEST_TRIALS, numTrials - 1, (int) block[Control::MostTrials] + 1}));
     if (stepsSinceFailure < 0)
         return fill(block);
     // The sums are those of the state put back, unless its step got as far as to leave others.
