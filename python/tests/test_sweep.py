@@ -269,9 +269,10 @@ def test_a_worker_that_dies_is_a_failed_run(threads, deadly_one):
 
 
 @pytest.mark.parametrize(("times", "failure"), [(1, None), (100, "scheduler-connection-lost")])
-def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure):
-    """As all are when the scheduler is started anew; but not for ever."""
-    from distributed import CancelledError
+@pytest.mark.parametrize("error", ["CancelledError", "TimeoutError"])
+def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure, error):
+    """As all are when the scheduler is started anew, or of whose result there is no word; but not for ever."""
+    distributed = pytest.importorskip("distributed")
 
     runner = DaskRunner.__new__(DaskRunner)
     runner._client = SimpleNamespace(close=lambda: None)
@@ -282,7 +283,8 @@ def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure):
         begun.append(list(works))
         for work in works:
             cancelled = work == (1, 0) and len(begun) <= times
-            yield work, CancelledError("scheduler-connection-lost") if cancelled else run_case(cases[work[0]], work[1])
+            lost = getattr(distributed, error)("scheduler-connection-lost")
+            yield work, lost if cancelled else run_case(cases[work[0]], work[1])
 
     monkeypatch.setattr(DaskRunner, "_outcomes", outcomes)
     results, _ = run_sweep(cases, runner)

@@ -30,6 +30,8 @@ Work = tuple[int, int]
 """The index of a case and that of one of its methods."""
 _TRIES_ALONE = 3
 """How often a run is begun that a Dask cluster cancels though nothing else is run beside it."""
+_LOST_AFTER = 30.0
+"""After how many seconds without an answer the result of a run that has ended counts as lost."""
 SweepProgress = Callable[[Work, str, float], None]
 """Called with a piece of work, what is being done, and the fraction that is done."""
 
@@ -238,6 +240,7 @@ class DaskRunner:
     ) -> Generator[tuple[Work, IntegratorRun], None, None]:
         """See `Runner`."""
         from distributed import CancelledError, KilledWorker
+        from distributed import TimeoutError as NoAnswerError
 
         # As bytes, which only the process that runs them unpacks: what cannot be unpacked there is a failed run.
         sent = {index: pickle.dumps(cases[index]) for index in {case for case, _ in works}}
@@ -252,7 +255,7 @@ class DaskRunner:
             lost: list[Work] = []
             with closing(self._outcomes(sent, works)) as outcomes:
                 for work, outcome in outcomes:
-                    if isinstance(outcome, (KilledWorker, CancelledError)):
+                    if isinstance(outcome, (KilledWorker, CancelledError, NoAnswerError)):
                         lost.append(work)
                         progress(work, "lost with its worker, waiting", 0.0)
                     else:
@@ -261,7 +264,7 @@ class DaskRunner:
                 for _ in range(_TRIES_ALONE):
                     progress(work, "starting alone", 0.0)
                     [(_, outcome)] = self._outcomes(sent, [work])
-                    if not isinstance(outcome, CancelledError):
+                    if not isinstance(outcome, (CancelledError, NoAnswerError)):
                         break
                 yield work, failed(work, outcome) if isinstance(outcome, BaseException) else outcome
         finally:
@@ -279,9 +282,10 @@ class DaskRunner:
             futures[self._client.submit(_run_pickled, sent[index], method, pure=False, key=key)] = (index, method)
         try:
             for future in as_completed(futures, loop=self._client.loop):
-                # A result that went with its worker is computed again meanwhile, and may end otherwise.
+                # A result that went with its worker is computed again meanwhile, and may end otherwise. If that happens
+                # just while it is asked for, the client can wait for ever for word of it.
                 try:
-                    outcome = future.result()
+                    outcome = future.result(timeout=_LOST_AFTER)
                 except Exception as error:
                     outcome = error
                 yield futures[future], outcome
