@@ -13,11 +13,26 @@ os.environ.setdefault("OPENMM_DEFAULT_PLATFORM", "CPU")
 import openmm  # noqa: E402
 import pytest  # noqa: E402
 
+# OpenCL is tested in double precision and with these files alone, for PoCL takes seconds to compile; the C++ tests tell
+# most of it. (OpenMM's own constraint solver and its minimiser, which other files use, fail there.)
+ON_OPENCL = ("test_step_to", "test_reversibility")
+PRESENT = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
+if "OpenCL" in PRESENT:
+    openmm.Platform.getPlatform("OpenCL").setPropertyDefaultValue("Precision", "double")
 
-@pytest.fixture(params=["Reference", "CPU"])
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that takes a platform on those that its file is meant for."""
+    if "platform" in metafunc.fixturenames:
+        names = ["Reference", "CPU"]
+        if metafunc.module.__name__ in ON_OPENCL and "OpenCL" in PRESENT:
+            names.append("OpenCL")
+        metafunc.parametrize("platform", names, indirect=True)
+
+
+@pytest.fixture
 def platform(request: pytest.FixtureRequest) -> str:
     """The name of a platform on which the integrator runs."""
-    names = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
-    if request.param not in names:
+    if request.param not in PRESENT:
         pytest.skip(f"this OpenMM has no platform {request.param}")
     return request.param
