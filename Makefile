@@ -148,6 +148,8 @@ $(BIN)/python:
 
 $(TOOLS): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --group dev
+	-$(BIN)/python -m pip download --quiet --no-deps --dest $(VENV)/gpu-wheels \
+		$(foreach package,cuda-12 cuda-13 hip-6 hip-7,"openmm-$(package)==8.6.*") # for test_gpu_libraries.py
 	touch $@
 
 $(DOCS_TOOLS): pyproject.toml | $(BIN)/python
