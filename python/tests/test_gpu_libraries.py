@@ -14,8 +14,8 @@ from pathlib import Path
 import openmm.version
 import pytest
 
-# `make test` downloads OpenMM's packages for GPUs to this folder and does not install them: without a driver they cannot be
-# loaded.
+# `make test` downloads OpenMM's packages for GPUs to this folder, and does not install them: without a driver they
+# cannot be loaded.
 WHEELS = Path(sys.prefix) / "gpu-wheels"
 
 SCRIPT = """
