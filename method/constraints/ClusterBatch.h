@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_CLUSTERBATCH_H_
 #define OPENMMVRATTLE_CLUSTERBATCH_H_
 
-#include "constraints/ConstraintSystem.h"
+#include "constraints/DistanceConstraint.h"
 #include "openmm/Vec3.h"
 #include <memory>
 #include <tuple>

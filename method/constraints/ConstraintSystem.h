@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
-#include "constraints/ClusterCut.h"
+#include "constraints/DistanceConstraint.h"
 #include "expressions/ExpressionGroup.h"
 #include "openmm/Vec3.h"
 #include <limits>
@@ -16,12 +16,7 @@
 namespace OpenMMVRattle {
 
 class ClusterBatch;
-
-/** The distance between two particles is fixed: |q1 - q2| = length (nm). */
-struct DistanceConstraint {
-    int particle1, particle2;
-    double length;
-};
+struct ClusterLayout;
 
 /**
  * The constraints g(q) = 0 of a system of particles, their Jacobian G = dg/dq, and the products with it that the method needs.
@@ -309,26 +304,6 @@ private:
     struct Stretch {
         int first, end;
     };
-    /** What the constructor works on: constraints of both kinds, distances first. */
-    struct Given {
-        const std::vector<DistanceConstraint>& distances;
-        const std::vector<ExpressionConstraint>& expressions;
-        int getSize() const {
-            return (int) (distances.size() + expressions.size());
-        }
-        bool isExpression(int k) const {
-            return k >= (int) distances.size();
-        }
-        const ExpressionConstraint& getExpression(int k) const {
-            return expressions[k - distances.size()];
-        }
-    };
-    /** A cluster that is in no batch: the constraints of the whole, or of each piece, and the joints. */
-    struct GeneralCluster {
-        std::vector<ClusterCut::Piece> pieces;
-        std::vector<int> joints;
-        bool hasWideColumns; // for which it is a part of its own
-    };
     /** Constraints of an expression group that are in one part: the places first, ..., end - 1 in the group. */
     struct GroupRange {
         int group, first, end;
@@ -338,21 +313,10 @@ private:
         int entry, constraint, particle;
         double sign;
     };
-    std::vector<int> findMovingParticles(const Given& given, int k) const;
-    std::vector<std::vector<int>> findClusters(const Given& given, const std::vector<int>& members) const;
-    bool orderForElimination(const Given& given, std::vector<int>& members) const;
-    std::vector<int> walk(const Given& given, const std::vector<int>& cluster) const;
-    std::vector<int> walkThroughParticles(const Given& given, const std::vector<int>& cluster,
-                                          const std::map<int, std::vector<int>>& constraintsOf) const;
-    std::vector<int> walkThroughConstraints(const Given& given, const std::vector<int>& cluster,
-                                            const std::map<int, std::vector<int>>& constraintsOf) const;
-    GeneralCluster cutAndOrder(const Given& given, const std::vector<int>& cluster) const;
-    void orderJoints(const Given& given, GeneralCluster& cluster) const;
-    void append(const Given& given, const std::vector<int>& members);
-    void groupExpressions(const Given& given);
+    void groupExpressions();
     void findStretches();
     void findCouplings();
-    void findParts(const std::vector<GeneralCluster>& general);
+    void findParts(const ClusterLayout& layout);
     void findGroupRanges();
     void findJointEnds();
     void findFreeParticles(const std::vector<char>& isInBatch);

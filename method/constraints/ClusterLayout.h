@@ -1,0 +1,48 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_CLUSTERLAYOUT_H_
+#define OPENMMVRATTLE_CLUSTERLAYOUT_H_
+
+#include "constraints/ClusterBatch.h"
+#include "constraints/ClusterCut.h"
+#include "expressions/ExpressionGroup.h"
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * How the constraints of a System fall into clusters, which are joined by shared particles that move, and in which order each cluster
+ * is eliminated. It is a value, made once from masses and topology, and plain data to whoever reads it; constraints are counted as they
+ * are given, distances first and then expressions.
+ */
+struct ClusterLayout {
+    /** The number of constraints that a piece of a large cluster has. */
+    static constexpr int PIECE_SIZE = 1000;
+    /** Small clusters of one topology, in the order of their first particles. */
+    struct Batch {
+        int numBonds;
+        bool isTriangle;
+        std::vector<ClusterShape> shapes;
+        std::vector<int> constraints, particles; // cluster after cluster, in the order of ClusterBatch::arrange()
+    };
+    /** Another cluster: the constraints of the whole, or those of each piece if it is cut, and the joints between these. */
+    struct GeneralCluster {
+        std::vector<ClusterCut::Piece> pieces;
+        std::vector<int> joints;
+        bool hasWideColumns; // of its factor
+    };
+
+    /**
+     * @param inverseMasses    1/mass of each particle, 0 for one that does not move; a distance constraint between two of
+     *                         these is in no cluster
+     */
+    ClusterLayout(const std::vector<double>& inverseMasses, const std::vector<DistanceConstraint>& distances,
+                  const std::vector<ExpressionConstraint>& expressions);
+    std::vector<Batch> batches;
+    std::vector<GeneralCluster> general; // first those that are not cut, of these the ones with an expression last
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_CLUSTERLAYOUT_H_
