@@ -268,7 +268,10 @@ def test_a_worker_that_dies_is_a_failed_run(threads, deadly_one):
             assert result.runs[0].failure is None
 
 
-@pytest.mark.parametrize(("times", "failure"), [(1, None), (100, "scheduler-connection-lost")])
+NO_WORD = "the cluster has no word of its result"
+
+
+@pytest.mark.parametrize(("times", "failure"), [(1, None), (100, "scheduler-connection-lost"), (100, NO_WORD)])
 @pytest.mark.parametrize("error", ["CancelledError", "TimeoutError"])
 def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure, error):
     """As all are when the scheduler is started anew, or of whose result there is no word; but not for ever."""
@@ -283,7 +286,7 @@ def test_a_run_that_is_cancelled_is_begun_again(monkeypatch, times, failure, err
         begun.append(list(works))
         for work in works:
             cancelled = work == (1, 0) and len(begun) <= times
-            lost = getattr(distributed, error)("scheduler-connection-lost")
+            lost = getattr(distributed, error)(*([failure] if failure != NO_WORD else []))
             yield work, lost if cancelled else run_case(cases[work[0]], work[1])
 
     monkeypatch.setattr(DaskRunner, "_outcomes", outcomes)

@@ -246,7 +246,10 @@ class DaskRunner:
         sent = {index: pickle.dumps(cases[index]) for index in {case for case, _ in works}}
 
         def failed(work: Work, error: BaseException) -> IntegratorRun:
-            return failed_run(cases[work[0]].methods()[work[1]], " ".join(str(error).split()))
+            reason = (
+                " ".join(str(error).split()) or "the cluster has no word of its result"
+            )  # TimeoutError says nothing
+            return failed_run(cases[work[0]].methods()[work[1]], reason)
 
         try:
             # A run that kills its worker takes others with it: those whose results were there, and those that had begun
