@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/AutomaticControl.h"
+#include "step/StepDensity.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -44,15 +45,11 @@ const double SETTLING = 0.1;
 const double SHORT = 0.1;
 
 double f(double x) {
-    const double one = 1 - SMALLEST;
-    return (x - SMALLEST) - one * one / (x - SMALLEST);
+    return StepDensity::f(x, SMALLEST);
 }
 
-// Without cancellation for y < 0.
 double inverseOfF(double y) {
-    const double one = 1 - SMALLEST;
-    const double root = std::sqrt(y * y + 4 * one * one);
-    return SMALLEST + (y > 0 ? 0.5 * (y + root) : 2 * one * one / (root - y));
+    return StepDensity::inverseOfF(y, SMALLEST);
 }
 
 double sixteenthPower(double x) {

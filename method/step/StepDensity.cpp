@@ -35,21 +35,20 @@ double StepDensity::limitDerivative(double u) const {
     return (upperSlope - lower * k) / (denominator * denominator);
 }
 
-// f(rho) = (rho - a) - (1 - a)^2/(rho - a) maps (a, infinity) onto the reals, with f(1) = 0.
-double StepDensity::f(double rho) const {
-    double x = rho - smallest, one = 1 - smallest;
+double StepDensity::f(double rho, double a) {
+    const double x = rho - a, one = 1 - a;
     return x - one * one / x;
 }
 
 // The positive root of x^2 - y x - (1-a)^2 = 0, without cancellation for y < 0.
-double StepDensity::inverseOfF(double y) const {
-    double one = 1 - smallest;
-    double root = std::sqrt(y * y + 4 * one * one);
-    double x = y > 0 ? 0.5 * (y + root) : 2 * one * one / (root - y);
-    return smallest + x;
+double StepDensity::inverseOfF(double y, double a) {
+    const double one = 1 - a;
+    const double root = std::sqrt(y * y + 4 * one * one);
+    return a + (y > 0 ? 0.5 * (y + root) : 2 * one * one / (root - y));
 }
 
 double StepDensity::boundedUpdate(double u, double previous) const {
     double margin = DOMAIN_MARGIN * (1 - smallest);
-    return inverseOfF(2 * f(std::max(u, smallest + margin)) - f(std::max(previous, smallest + margin)));
+    return inverseOfF(
+        2 * f(std::max(u, smallest + margin), smallest) - f(std::max(previous, smallest + margin), smallest), smallest);
 }

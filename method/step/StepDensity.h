@@ -35,6 +35,9 @@ public:
     static double sumUpdate(double u, double previous) {
         return 2 * u - previous;
     }
+    /** f(rho) = (rho - a) - (1 - a)^2/(rho - a) maps (a, infinity) onto the reals, with f(1) = 0; and its inverse. */
+    static double f(double rho, double a);
+    static double inverseOfF(double y, double a);
     /** rho[n+1/2] of the update Bounded: f(rho[n+1/2]) + f(rho[n-1/2]) = 2 f(u); always larger than nominal/maximum. */
     double boundedUpdate(double u, double previous) const;
     /** Whether a density asks for a step of more than twice the maximum. */
@@ -56,8 +59,6 @@ public:
     }
 
 private:
-    double f(double rho) const;
-    double inverseOfF(double y) const;
     Update update;
     double smallest; // a = nominal/maximum, 0 if there is no bound
     // B(u) = (lower + upperSlope u)/(1 + k u); with k = 0: lower + (1 - lower) u
