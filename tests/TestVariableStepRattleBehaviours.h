@@ -238,7 +238,7 @@ inline void testConstrainedMasslessParticles() {
     integrator.clearMonitors();
     Context context(system, integrator, getTestPlatform());
     context.setPositions({Vec3(-1, 0, 0), Vec3(1, 0, 0)});
-    context.setVelocitiesToTemperature(300.0);
+    context.setVelocitiesToTemperature(300.0, 5);
     integrator.step(1);
     State state = context.getState(State::Positions | State::Velocities);
     for (int i = 0; i < 2; i++) {
@@ -344,7 +344,7 @@ inline void testInitialTemperature() {
     integrator.clearMonitors();
     Context context(system, integrator, getTestPlatform());
     context.setPositions(positions);
-    context.setVelocitiesToTemperature(temperature);
+    context.setVelocitiesToTemperature(temperature, 5);
     double kinetic = 0;
     const vector<Vec3> velocities = context.getState(State::Velocities).getVelocities();
     for (const Vec3& v : velocities)
