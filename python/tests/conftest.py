@@ -22,8 +22,9 @@ if "OpenCL" in PRESENT:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test that takes a platform on those that its file is meant for."""
-    if "platform" in metafunc.fixturenames:
+    """Run a test that takes a platform on those that its file is meant for, unless it says itself on which."""
+    says_itself = any("platform" in str(mark.args[0]) for mark in metafunc.definition.iter_markers("parametrize"))
+    if "platform" in metafunc.fixturenames and not says_itself:
         names = ["Reference", "CPU"]
         if metafunc.module.__name__ in ON_OPENCL and "OpenCL" in PRESENT:
             names.append("OpenCL")
