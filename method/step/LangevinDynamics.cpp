@@ -212,18 +212,10 @@ void LangevinDynamics::evaluateOnStep() {
 }
 
 std::function<void()> LangevinDynamics::remember() {
-    return [this, positions = q, velocities = v, forces = force, energy = groupEnergy, parameters = theta,
-            nextParameters = target, memory = getMemory()] {
-        q = positions;
-        v = velocities;
-        force = forces;
-        groupEnergy = energy;
-        theta = parameters;
+    return [this, positions = q, velocities = v, forces = force, energy = groupEnergy, nextParameters = target,
+            memory = getMemory()] {
+        resume(positions, velocities, forces, energy, memory);
         target = nextParameters;
-        lambda = memory.multipliers;
-        values[0] = memory.monitorValue;
-        lastSubstep = memory.lastSubstep;
-        settle();
     };
 }
 

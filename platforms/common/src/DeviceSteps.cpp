@@ -47,6 +47,17 @@ LargeClusters::Limits findLimits(OpenMM::ComputeContext& context) {
     return limits;
 }
 
+// Outside mixed precision there are no corrections, and nothing reads the argument.
+OpenMM::ArrayInterface& correctionsOf(OpenMM::ComputeContext& context) {
+    return context.getUseMixedPrecision() ? context.getPosqCorrection() : context.getPosq();
+}
+
+// For arguments that change from launch to launch.
+void addEmpty(ComputeKernel& kernel, int count) {
+    for (int i = 0; i < count; i++)
+        kernel->addArg();
+}
+
 } // namespace
 
 DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system) :
@@ -214,13 +225,7 @@ void DeviceSteps::compile(StepProgram::Update update) {
 
 // The arguments in the order of kernels/step.cc; those that change from launch to launch come first and are set there.
 void DeviceSteps::setArguments(Kernels& created) {
-    // Outside mixed precision there are no corrections, and nothing reads the argument.
-    OpenMM::ArrayInterface& corrections =
-        context.getUseMixedPrecision() ? context.getPosqCorrection() : context.getPosq();
-    auto addEmpty = [](ComputeKernel& kernel, int count) {
-        for (int i = 0; i < count; i++)
-            kernel->addArg();
-    };
+    OpenMM::ArrayInterface& corrections = correctionsOf(context);
     auto addState = [&](ComputeKernel& kernel) {
         kernel->addArg(program->getNumSlots());
         kernel->addArg(context.getPaddedNumAtoms());
@@ -283,12 +288,7 @@ void DeviceSteps::addLargeTables(ComputeKernel& kernel) {
 
 // The same for kernels/large.cc.
 void DeviceSteps::setLargeArguments(Kernels& created) {
-    OpenMM::ArrayInterface& corrections =
-        context.getUseMixedPrecision() ? context.getPosqCorrection() : context.getPosq();
-    auto addEmpty = [](ComputeKernel& kernel, int count) {
-        for (int i = 0; i < count; i++)
-            kernel->addArg();
-    };
+    OpenMM::ArrayInterface& corrections = correctionsOf(context);
     auto addState = [&](ComputeKernel& kernel) {
         kernel->addArg((int) large.getPieces().size());
         kernel->addArg(context.getPaddedNumAtoms());
@@ -321,7 +321,7 @@ void DeviceSteps::setLargeArguments(Kernels& created) {
     addState(created.advanceLarge);
 }
 
-// A placeholder needs the exact type.
+// The type must be that of the kernel's parameter.
 void DeviceSteps::setMixed(ComputeKernel& kernel, int index, double value) {
     if (isMixed)
         kernel->setArg(index, value);
