@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """A protein in water at constant energy, with automatic step control and with VerletIntegrator, side by side.
 
-    python benchmarks/proof.py [--system villin] [--platform CPU] [--time 100] [--step 2] [--page]
+    python benchmarks/proof.py [--system villin] [--platform CPU] [--time 100] [--step 2] [--resume] [--page]
 
 Both integrators start from one state and take turns of a few steps each, so that whatever else the machine does hits
 both alike. In the middle each run is stopped, saved as a checkpoint, and goes on in a Context with an integrator that
@@ -12,6 +12,9 @@ constraint, and the energy before and after the restart.
 The systems: `villin`, the headpiece of 36 residues in water with 8,867 atoms that comes with OpenMM, and
 `alanine-dipeptide` in a box of 2.5 nm; both with rigid water, rigid bonds to hydrogen, and PME.
 
+A run takes an hour or more. Every half minute it is saved in the folder ``--output``; the same command with
+``--resume`` goes on with what is there, for example after the machine was needed for something else.
+
 Prints a table, and writes proof.json, proof.csv with the energies, and proof.png to the folder ``--output``; with
 ``--page`` it puts table and figure into docs/proof.md as well.
 """
@@ -19,6 +22,7 @@ Prints a table, and writes proof.json, proof.csv with the energies, and proof.pn
 from __future__ import annotations
 
 import argparse
+import base64
 import csv
 import json
 import math
@@ -29,6 +33,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openmm
@@ -43,6 +48,8 @@ VERLET, AUTOMATIC = "VerletIntegrator", "automatic"
 COLOURS = {VERLET: "#E69F00", AUTOMATIC: "#0072B2"}
 TURN = 25
 """Steps that one integrator takes before it is the other's turn, and between two looks at the energy."""
+SAVE_EVERY = 30.0
+"""Seconds between two savings of an unfinished run."""
 SETTLING = 4
 """Turns whose energies are not counted: the thermostat leaves velocities that lie half a step behind the positions, and
 that are not quite tangent to the constraints, which is no typical state for a method that has both at one time."""
@@ -142,12 +149,16 @@ class Summary:
 class Problem:
     """A System in equilibrium and the platform on which it runs."""
 
-    def __init__(self, name: str, platform: str, relaxation: float) -> None:
+    def __init__(
+        self, name: str, platform: str, relaxation: float, threads: int | None = None, start: openmm.State | None = None
+    ) -> None:
         """
         Args:
             name: of the system.
             platform: of OpenMM.
             relaxation: how long it is relaxed at constant temperature, in ps.
+            threads: of the platform CPU; its own choice by default.
+            start: of a run that was begun before, which needs no relaxation.
         """
         modeller = SYSTEMS[name]()
         self.name = name
@@ -156,14 +167,18 @@ class Problem:
         self.platform = openmm.Platform.getPlatformByName(platform)
         # Single precision drifts by itself at constant energy.
         self.properties = {"Precision": "mixed"} if "Precision" in self.platform.getPropertyNames() else {}
+        if threads is not None and "Threads" in self.platform.getPropertyNames():
+            self.properties["Threads"] = str(threads)
         integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 5.0, 0.002)
         integrator.setRandomNumberSeed(1)
         context = openmm.Context(self.system, integrator, self.platform, self.properties)
-        context.setPositions(modeller.positions)
-        openmm.LocalEnergyMinimizer.minimize(context, 10.0, 200)
-        context.setVelocitiesToTemperature(TEMPERATURE, 2)
-        integrator.step(round(relaxation / 0.002))
-        self.start = context.getState(positions=True, velocities=True)
+        if start is None:
+            context.setPositions(modeller.positions)
+            openmm.LocalEnergyMinimizer.minimize(context, 10.0, 200)
+            context.setVelocitiesToTemperature(TEMPERATURE, 2)
+            integrator.step(round(relaxation / 0.002))
+            start = context.getState(positions=True, velocities=True)
+        self.start = start
         self.device = None
         if "DeviceName" in self.platform.getPropertyNames():
             self.device = self.platform.getPropertyValue(context, "DeviceName")
@@ -201,23 +216,71 @@ def restart(problem: Problem, run: Run, context: openmm.Context, step: float) ->
     return again
 
 
-def simulate(problem: Problem, total_time: float, step: float) -> list[Run]:
+class Unfinished:
+    """The file that an unfinished run goes on from."""
+
+    def __init__(self, path: Path, settings: dict[str, object]) -> None:
+        """
+        Args:
+            path: of the file.
+            settings: of the run; one with others must not be mixed with it.
+        """
+        self.path, self.settings = path, settings
+        self.saved: dict[str, Any] | None = None
+
+    def load(self) -> None:
+        """Take what was saved.
+
+        Raises:
+            ValueError: if that was a run with other settings.
+        """
+        self.saved = json.loads(self.path.read_text(encoding="utf-8"))
+        if self.saved["settings"] != self.settings:
+            raise ValueError(f"{self.path} is of a run with other settings: {self.saved['settings']}.")
+
+    def start(self) -> openmm.State | None:
+        """Where both runs began, if something was loaded."""
+        return openmm.XmlSerializer.deserialize(self.saved["start"]) if self.saved else None
+
+    def save(self, turn: int, problem: Problem, runs: Sequence[Run], contexts: dict[str, openmm.Context]) -> None:
+        """Save everything that was computed before a turn."""
+        saved = {
+            "settings": self.settings,
+            "start": openmm.XmlSerializer.serialize(problem.start),
+            "turn": turn,
+            "runs": [asdict(run) for run in runs],
+            "checkpoints": {
+                name: base64.b64encode(context.createCheckpoint()).decode() for name, context in contexts.items()
+            },
+        }
+        new = self.path.with_suffix(".new")
+        new.write_text(json.dumps(saved), encoding="utf-8")
+        new.replace(self.path)  # never half a file
+
+
+def simulate(problem: Problem, total_time: float, step: float, unfinished: Unfinished) -> list[Run]:
     """Both integrators in turns, to the same time.
 
     Args:
         problem: what to simulate.
         total_time: in ps.
         step: the nominal one of both, in ps.
+        unfinished: what it goes on from, and where it is saved.
     """
-    runs = [Run(VERLET), Run(AUTOMATIC)]
+    runs, first = [Run(VERLET), Run(AUTOMATIC)], 0
     contexts = {run.name: problem.context(make_integrator(run.name, step)) for run in runs}
-    for run in runs:
-        contexts[run.name].getIntegrator().step(1)  # what is prepared once is not the cost of a turn
-        run.times.append(contexts[run.name].getTime()._value)
-        run.energies.append(energy_of(contexts[run.name]))
+    if unfinished.saved:
+        runs, first = [Run(**run) for run in unfinished.saved["runs"]], unfinished.saved["turn"]
+        for name, checkpoint in unfinished.saved["checkpoints"].items():
+            contexts[name].loadCheckpoint(base64.b64decode(checkpoint))
+    else:
+        for run in runs:
+            contexts[run.name].getIntegrator().step(1)  # what is prepared once is not the cost of a turn
+            run.times.append(contexts[run.name].getTime()._value)
+            run.energies.append(energy_of(contexts[run.name]))
     turns = round(total_time / step / TURN)
-    shown = time.monotonic()
-    for turn in range(turns):
+    saved = time.monotonic()
+    for turn in range(first, turns):
         for run in runs if turn % 2 else reversed(runs):
             if turn == turns // 2:
                 contexts[run.name] = restart(problem, run, contexts[run.name], step)
@@ -233,8 +296,9 @@ def simulate(problem: Problem, total_time: float, step: float) -> list[Run]:
             if turn % 20 == 0 or turn in (turns // 2, turns - 1):
                 error = constraint_error(problem.system, state.getPositions(asNumpy=True)._value)
                 run.constraint_error = max(run.constraint_error, error)
-        if time.monotonic() > shown + 30:
-            shown = time.monotonic()
+        if time.monotonic() > saved + SAVE_EVERY:
+            unfinished.save(turn + 1, problem, runs, contexts)
+            saved = time.monotonic()
             print(f"{runs[0].times[-1]:.1f} of {total_time:g} ps", file=sys.stderr, flush=True)
     for run in runs:
         run.evaluations = len(run.seconds) * TURN  # one a step; ours counts, since its last restart
@@ -325,23 +389,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--system", choices=SYSTEMS, default="villin")
     parser.add_argument("--platform", default="CPU")
+    parser.add_argument("--threads", type=int, help="of the platform CPU")
     parser.add_argument("--time", type=float, default=100.0, help="of each run, in ps")
     parser.add_argument("--step", type=float, default=2.0, help="the nominal one of both integrators, in fs")
     parser.add_argument("--relaxation", type=float, default=5.0, help="at constant temperature beforehand, in ps")
     parser.add_argument("--output", type=Path, default=Path("out/proof"), metavar="FOLDER")
+    parser.add_argument("--resume", action="store_true", help="go on with the unfinished run in the folder --output")
     parser.add_argument("--page", action="store_true", help="put table and figure into docs/proof.md")
     options = parser.parse_args(arguments)
     if options.time * 1000 / options.step < 2 * BLOCKS * TURN:
         parser.error(f"a drift needs at least {2 * BLOCKS * TURN} steps")
     options.output.mkdir(parents=True, exist_ok=True)
-    problem = Problem(options.system, options.platform, options.relaxation)
-    runs = simulate(problem, options.time, options.step / 1000)
+    settings = {
+        name: getattr(options, name) for name in ("system", "platform", "threads", "time", "step", "relaxation")
+    }
+    unfinished = Unfinished(options.output / "unfinished.json", settings)
+    if options.resume and unfinished.path.exists():
+        try:
+            unfinished.load()
+        except ValueError as error:
+            parser.error(str(error))
+    problem = Problem(options.system, options.platform, options.relaxation, options.threads, unfinished.start())
+    runs = simulate(problem, options.time, options.step / 1000, unfinished)
     summaries = summarize(problem, runs)
     lines = [
         pages.provenance(problem.device),
         "",
         f"{problem.name}: {problem.atoms:,} atoms, {problem.system.getNumConstraints():,} constraints, platform "
-        f"{options.platform}{', mixed precision' if problem.properties else ''}, nominal step {options.step:g} fs.",
+        f"{options.platform}{', mixed precision' if 'Precision' in problem.properties else ''}"
+        f"{f', {options.threads} thread(s)' if options.threads else ''}, nominal step {options.step:g} fs.",
         "",
         *table(summaries),
     ]
@@ -349,6 +425,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (options.output / "proof.json").write_text(json.dumps([asdict(s) for s in summaries], indent=2), encoding="utf-8")
     write_csv(runs, options.output / "proof.csv")
     draw(problem, runs).savefig(options.output / "proof.png")
+    unfinished.path.unlink(missing_ok=True)
     if options.page:
         name = "proof" if options.platform == "CPU" else f"proof-{options.platform.lower()}"
         shutil.copy(options.output / "proof.png", pages.DOCS / "images" / f"{name}.png")

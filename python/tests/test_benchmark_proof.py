@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from project_scripts import ROOT, load_script
 
@@ -28,7 +29,22 @@ def test_a_short_run(proof: ModuleType, tmp_path: Path, monkeypatch: pytest.Monk
     page = tmp_path / "proof.md"
     page.write_text("<!-- measured: proof -->\n<!-- end: proof -->\n")
     arguments = ["--system", "alanine-dipeptide", "--time", "0.32", "--relaxation", "0.02", "--output", str(tmp_path)]
-    assert proof.main([*arguments, "--page"]) == 0
+    monkeypatch.setattr(proof, "SAVE_EVERY", 0.0)
+    save = proof.Unfinished.save
+
+    def save_and_stop(self: object, turn: int, *rest: object) -> None:
+        save(self, turn, *rest)
+        if turn == 15:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(proof.Unfinished, "save", save_and_stop)
+        proof.main(arguments)
+    begun = json.loads((tmp_path / "unfinished.json").read_text())
+    with pytest.raises(SystemExit):
+        proof.main([*arguments, "--step", "1", "--resume"])
+    assert proof.main([*arguments, "--resume", "--page"]) == 0
+    assert not (tmp_path / "unfinished.json").exists()
     verlet, automatic = json.loads((tmp_path / "proof.json").read_text())
     assert (verlet["integrator"], automatic["integrator"]) == ("VerletIntegrator", "automatic")
     assert verlet["steps"] == automatic["steps"] == 160
@@ -42,6 +58,9 @@ def test_a_short_run(proof: ModuleType, tmp_path: Path, monkeypatch: pytest.Monk
         assert 0 < run["fluctuation"] < 5
     rows = list(csv.DictReader((tmp_path / "proof.csv").open()))
     assert len(rows) == 2 * 41
+    energies = [float(row["energy (kJ/mol)"]) for row in rows if row["integrator"] == "automatic"]
+    assert energies[:16] == pytest.approx(begun["runs"][1]["energies"], abs=1e-6)
+    assert np.ptp(energies[4:]) < 20  # went on where it had stopped: another start differs by hundreds
     text = page.read_text()
     assert "drift of the total energy" in text and "![Total energy of both runs](images/proof.png)" in text
     assert (tmp_path / "images" / "proof.png").read_bytes().startswith(b"\x89PNG")
