@@ -5,6 +5,7 @@
 #include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
+#include <algorithm>
 #include <istream>
 #include <ostream>
 #include <string>
@@ -214,6 +215,19 @@ const vector<double>& RunState::getMethodValues(const string& name, size_t count
     if (entry == methodValues.end() || entry->second.size() != count)
         throwDamaged();
     return entry->second;
+}
+
+void RunState::Archive::add(const string& name, vector<double>& values, size_t count) {
+    if (to != nullptr)
+        to->methodValues[name] = values;
+    else
+        values = from.getMethodValues(name, count);
+}
+
+void RunState::Archive::add(const string& name, double* values, size_t count) {
+    vector<double> list(values, values + count);
+    add(name, list, count);
+    std::copy(list.begin(), list.end(), values);
 }
 
 void RunState::requireSizes(int numParticles, int numMonitors) const {

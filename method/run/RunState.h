@@ -36,9 +36,28 @@ struct RunState {
     void requireSizes(int numParticles, int numMonitors) const;
     /** The method's numbers of a name; throws an OpenMMException if they are not there or not as many as wanted. */
     const std::vector<double>& getMethodValues(const std::string& name, size_t count) const;
-    double getMethodValue(const std::string& name) const {
-        return getMethodValues(name, 1)[0];
-    }
+    /** Writes the method's numbers into a saved run or reads them from it, so that what they are is listed once. */
+    class Archive {
+    public:
+        explicit Archive(RunState& to) : to(&to), from(to) {
+        }
+        explicit Archive(const RunState& from) : to(nullptr), from(from) {
+        }
+        void add(const std::string& name, std::vector<double>& values, size_t count);
+        void add(const std::string& name, double* values, size_t count);
+        void add(const std::string& name, double& value) {
+            add(name, &value, 1);
+        }
+        void add(const std::string& name, bool& value) {
+            double number = value;
+            add(name, number);
+            value = number != 0;
+        }
+
+    private:
+        RunState* to; // or null
+        const RunState& from;
+    };
 
     unsigned long long system = 0;     // fingerprint of the System
     unsigned long long context = 0;    // fingerprint of the Context: RunDevice::getFingerprint()

@@ -7,9 +7,10 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include "step/ClusterForces.h"
-#include "step/Dynamics.h"
 #include "step/LangevinSettings.h"
 #include <cstdint>
+#include <functional>
+#include <map>
 #include <string>
 #include <vector>
 
@@ -40,10 +41,11 @@ namespace OpenMMVRattle {
  * and k is the smallest number with 2^k >= (U/U_ref)^(2/3)/c. U_ref follows U as a running median at a bounded rate: nothing can
  * capture it, and no calibration is needed. docs/langevin.md has the reasons.
  *
- * As Dynamics has it, each substep is a pass of step() and finish().
+ * Each substep is a pass of step() and finish(). All that a run asks of a method has the same meaning as in VRattleDynamics.
  */
-class LangevinDynamics : public Dynamics {
+class LangevinDynamics {
 public:
+    typedef ConstraintSolver::Parallel Parallel;
     struct Settings {
         double stepSize = 0, tolerance = 1e-8; // H (ps); of the constraints, relative
         LangevinSettings langevin;
@@ -57,42 +59,42 @@ public:
 
     LangevinDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                      const std::vector<ExpressionConstraint>& expressions = {});
-    void setParallel(const Parallel& parallel, int numThreads) override;
-    void share(int count, const std::function<void(int, int)>& task) override {
+    void setParallel(const Parallel& parallel, int numThreads);
+    template <class Task> void share(int count, const Task& task) {
         solver.share(count, task);
     }
     void setSettings(const Settings& newSettings);
 
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions) override;
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-               const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
-    std::function<void()> remember() override;
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    std::function<void()> remember();
     Memory getMemory() const;
     /** Go on from a saved state, taken as it is, to the last bit. */
     void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                 const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
-    void setParameters(int expression, const std::map<std::string, double>& parameters) override {
+    void setParameters(int expression, const std::map<std::string, double>& parameters) {
         getConstraintSystem().writeParameters(expression, parameters, target);
     }
-    const ExpressionParameters& getParameters() const override {
+    const ExpressionParameters& getParameters() const {
         return theta;
     }
-    void adoptParameters() override;
-    void setReferences(const std::vector<double>& references) override;
-    std::vector<double> getReferences() const override {
+    void adoptParameters();
+    void setReferences(const std::vector<double>& references);
+    std::vector<double> getReferences() const {
         return {reference};
     }
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
-    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities) override;
-    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities) override;
-    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
     /** A substep: the steps have the size H, whatever maxStep says. Fails if 2^k_max + 1 substeps are not enough. */
-    double step(double maxStep) override;
-    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
-    void abandonStep() override;
-    void reverse() override;
+    double step(double maxStep);
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    void abandonStep();
+    void reverse();
 
     /**
      * The kinetic energy of P (v - d/2 M^-1 F), the velocities half a substep before: at these velocities and not the on-step ones a
@@ -119,35 +121,35 @@ public:
         givenNoise = numbers;
     }
 
-    const ConstraintSystem& getConstraintSystem() const override {
+    const ConstraintSystem& getConstraintSystem() const {
         return solver.getSystem();
     }
-    const std::vector<OpenMM::Vec3>& getPositions() const override {
+    const std::vector<OpenMM::Vec3>& getPositions() const {
         return q;
     }
-    const std::vector<OpenMM::Vec3>& getNextPositions() const override {
+    const std::vector<OpenMM::Vec3>& getNextPositions() const {
         return qNext;
     }
-    const std::vector<OpenMM::Vec3>& getVelocities() const override {
+    const std::vector<OpenMM::Vec3>& getVelocities() const {
         return v;
     }
-    const std::vector<OpenMM::Vec3>& getForces() const override {
+    const std::vector<OpenMM::Vec3>& getForces() const {
         return force;
     }
-    double getGroupEnergy() const override {
+    double getGroupEnergy() const {
         return groupEnergy;
     }
     /** 1: the steps have the size that they should have. */
-    double getDensity() const override {
+    double getDensity() const {
         return 1;
     }
-    const std::vector<double>& getMonitorValues() const override {
+    const std::vector<double>& getMonitorValues() const {
         return values;
     }
-    const std::vector<double>& getMultipliers() const override {
+    const std::vector<double>& getMultipliers() const {
         return lambda;
     }
-    long long getNumIterations() const override {
+    long long getNumIterations() const {
         return solver.getNumIterations();
     }
 

@@ -7,7 +7,6 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include "step/AutomaticSteps.h"
-#include "step/Dynamics.h"
 #include "step/MonitorControl.h"
 #include "step/StepSolver.h"
 #include "step/StepState.h"
@@ -31,16 +30,19 @@ namespace OpenMMVRattle {
  * Until finish() has returned, the state before the step is untouched. Momenta are kept as velocities: v stands for
  * M^-1 p[n], w for M^-1 p[n-1/2].
  */
-class VRattleDynamics : public Dynamics {
+class VRattleDynamics {
 public:
+    typedef ConstraintSolver::Parallel Parallel;
     typedef StepSettings Settings;
     typedef StepMemory Memory;
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
 
-    void setParallel(const Parallel& parallel, int numThreads) override;
-    void share(int count, const std::function<void(int, int)>& task) override {
+    /** Let threads share the work where that is faster. Results do not depend on their number, to the last bit. */
+    void setParallel(const Parallel& parallel, int numThreads);
+    /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
+    template <class Task> void share(int count, const Task& task) {
         constraints.share(count, task);
     }
 
@@ -52,9 +54,22 @@ public:
      */
     void setSettings(const Settings& settings);
 
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions) override;
+    /**
+     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
+     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
+     *
+     * @return whether the positions were changed
+     * @throws StepFailure    if there is no such configuration nearby
+     */
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
+    /**
+     * Start afresh at a state. The velocities are projected onto the constraints, whose parameters, those in force, are at rest
+     * and stay so until others are set.
+     *
+     * @throws StepFailure    if the multipliers or monitors are not defined there; then everything is as it was
+     */
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-               const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     /** All that a trial run or a start changes, to be put back. */
     struct Kept {
         Settings settings;
@@ -67,7 +82,8 @@ public:
     Kept keep() const;
     /** Put back what was kept, to the last bit. */
     void putBack(const Kept& kept);
-    std::function<void()> remember() override {
+    /** A function that puts back everything that it is now, to the last bit. */
+    std::function<void()> remember() {
         return [this, kept = keep()] { putBack(kept); };
     }
     Memory getMemory() const;
@@ -76,13 +92,15 @@ public:
      * its position equation is g(q[n+1]; theta[n+1]) = 0 (3.11), and the velocities at its end
      * G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
      */
-    void setParameters(int expression, const std::map<std::string, double>& parameters) override {
+    void setParameters(int expression, const std::map<std::string, double>& parameters) {
         getConstraintSystem().writeParameters(expression, parameters, target);
     }
-    const ExpressionParameters& getParameters() const override {
+    /** theta[n], those in force, and the rates of the step that has led to them. */
+    const ExpressionParameters& getParameters() const {
         return now.theta;
     }
-    void adoptParameters() override;
+    /** Put those that are set in force at once, before positions are projected and the run starts afresh with begin(). */
+    void adoptParameters();
     /**
      * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the
      * following steps are the same to the last bit if the forces are.
@@ -105,22 +123,30 @@ public:
     double findHalfStepValue() {
         return monitors.findHalfStepValue();
     }
-    void setReferences(const std::vector<double>& references) override {
+    /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
+    void setReferences(const std::vector<double>& references) {
         control->setReferences(references);
     }
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
-    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities) override;
+                     const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /**
+     * Go on with velocities that are the present ones seen from a uniformly moving frame, as a remover of the motion of the
+     * centre of mass leaves them in each step. Constraints between moving particles and their multipliers know nothing of it, so
+     * that it costs no more than to look.
+     *
+     * @return whether that is what they are; if not, nothing has been changed
+     */
+    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
     /** Go on with changed velocities at the same positions; as changeState(). */
-    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities) override;
+    void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
     /**
      * Go on with other forces at the same positions and velocities, since a parameter of a force has changed; as changeState().
      *
      * @param[in,out] forces    the applied forces; their storage is taken over, and that of the forces before left in its place
      * @throws StepFailure    if they are not finite; then nothing has been changed
      */
-    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
     /**
      * The first half of a step.
@@ -129,7 +155,7 @@ public:
      * @return the size of the step (ps)
      * @throws StepFailure    if the equations of the step have no solution that the iteration finds
      */
-    double step(double maxStep) override;
+    double step(double maxStep);
     /**
      * The second half of a step.
      *
@@ -140,12 +166,12 @@ public:
      *         better, and both halves are to be done again. This happens once, at a start with given reference values.
      * @throws StepFailure    if the forces are not finite or the constraints have become dependent
      */
-    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy) override;
+    bool finish(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     /**
      * The step in progress has failed, in either half or in between: nothing that was computed for it, as the density and the
      * reference values of a first step, is of any use to the next.
      */
-    void abandonStep() override;
+    void abandonStep();
     /** Whether the next step continues a sequence of densities; if not, it is the first one. */
     bool hasStarted() const {
         return control->hasStarted();
@@ -154,42 +180,43 @@ public:
     const AutomaticControl& getAutomaticControl() const {
         return automatic.getControl();
     }
-    void reverse() override;
+    /** Turn time around, without a force. */
+    void reverse();
 
-    const ConstraintSystem& getConstraintSystem() const override {
+    const ConstraintSystem& getConstraintSystem() const {
         return constraints.getSystem();
     }
-    const std::vector<OpenMM::Vec3>& getPositions() const override {
+    const std::vector<OpenMM::Vec3>& getPositions() const {
         return now.q;
     }
     /** q[n+1], after step(). */
-    const std::vector<OpenMM::Vec3>& getNextPositions() const override {
+    const std::vector<OpenMM::Vec3>& getNextPositions() const {
         return solver.next.q;
     }
-    const std::vector<OpenMM::Vec3>& getVelocities() const override {
+    const std::vector<OpenMM::Vec3>& getVelocities() const {
         return now.v;
     }
-    const std::vector<OpenMM::Vec3>& getForces() const override {
+    const std::vector<OpenMM::Vec3>& getForces() const {
         return now.force;
     }
-    double getGroupEnergy() const override {
+    double getGroupEnergy() const {
         return now.groupEnergy;
     }
     /** rho[n-1/2]. */
-    double getDensity() const override {
+    double getDensity() const {
         return control->getDensity();
     }
-    const std::vector<double>& getMonitorValues() const override {
+    const std::vector<double>& getMonitorValues() const {
         return control->getValues();
     }
     /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
-    std::vector<double> getReferences() const override {
+    std::vector<double> getReferences() const {
         return control->getReferences();
     }
-    const std::vector<double>& getMultipliers() const override {
+    const std::vector<double>& getMultipliers() const {
         return now.lambda;
     }
-    long long getNumIterations() const override {
+    long long getNumIterations() const {
         return solver.getNumIterations();
     }
     long long getNumRescues() const {

@@ -41,11 +41,11 @@ private:
 
 CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                  const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
-        HostVRattleDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings), compute(compute),
-        state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true), areSettingsOnDevice(false),
-        hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK), lastMaxTime(NO_LIMIT), settledTime(0),
-        settledCount(0), knownCount(0), groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true),
-        numDeviceRescues(0) {
+        HostVRattleDevice(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings),
+        context(context), compute(compute), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
+        areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
+        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
+        writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
     compute.initializeContexts();
     if (DeviceSteps::canTake(settings.expressions))
         steps = std::make_unique<DeviceSteps>(compute, context.getSystem());
@@ -299,7 +299,7 @@ double CommonRunDevice::getPositionRounding() const {
     return compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
 }
 
-bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) const {
+bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) {
     const double tolerance = getPositionRounding();
     for (size_t i = 0; i < masses.size(); i++)
         for (int d = 0; d < 3; d++)

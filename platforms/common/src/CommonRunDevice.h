@@ -5,7 +5,8 @@
 #define OPENMMVRATTLE_COMMONRUNDEVICE_H_
 
 #include "DeviceSteps.h"
-#include "HostVRattleDevice.h"
+#include "openmm/internal/ContextImpl.h"
+#include "run/HostVRattleDevice.h"
 #include <memory>
 
 namespace OpenMMVRattle {
@@ -50,7 +51,7 @@ public:
 protected:
     double computeForces() override;
     double getPositionRounding() const override;
-    bool differ(const Vectors& a, const Vectors& b) const override;
+    bool differ(const Vectors& a, const Vectors& b) override;
 
 private:
     bool canStepOnDevice();
@@ -64,6 +65,7 @@ private:
     void accept(const DeviceSteps::Report& report);
     void bringToHost();
     void takeToHost();
+    OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
     std::unique_ptr<DeviceSteps> steps; // none where the host takes them all
     DeviceSteps::State state; // of the device when it was read last

@@ -27,7 +27,8 @@ public:
                           const IntegratorSettings& settings) override {
         if (settings.langevin) { // whose steps are taken on the host, with forces from the GPU
             compute.initializeContexts();
-            device = makeHostRunDevice(context, std::make_unique<ComputeVectors>(context), integrator, settings);
+            device =
+                makeHostRunDevice(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings);
         }
         else
             device = std::make_unique<CommonRunDevice>(context, compute, integrator, settings);
@@ -36,7 +37,7 @@ public:
 
 private:
     OpenMM::ComputeContext& compute;
-    std::unique_ptr<HostRunDevice> device;
+    std::unique_ptr<RunDevice> device;
 };
 
 /**

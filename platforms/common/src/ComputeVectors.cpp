@@ -17,9 +17,9 @@ const double LARGEST_FORCE = 1 << 30;
 
 } // namespace
 
-ComputeVectors::ComputeVectors(OpenMM::ContextImpl& context) :
-        context(context), kernel(context.getPlatform().createKernel(UpdateStateDataKernel::Name(), context)),
-        numWrites(0) {
+ComputeVectors::ComputeVectors(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator) :
+        HostContext(context, integrator),
+        kernel(context.getPlatform().createKernel(UpdateStateDataKernel::Name(), context)), numWrites(0) {
     kernel.getAs<UpdateStateDataKernel>().initialize(context.getSystem());
 }
 

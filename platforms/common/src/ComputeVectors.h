@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_COMPUTEVECTORS_H_
 #define OPENMMVRATTLE_COMPUTEVECTORS_H_
 
-#include "ContextVectors.h"
+#include "HostContext.h"
 #include "openmm/Kernel.h"
 #include "openmm/internal/ContextImpl.h"
 
@@ -14,9 +14,9 @@ namespace OpenMMVRattle {
  * The state of a Context whose platform has it on a device. Each reading waits for the device and copies. A kernel of our own moves
  * it, for ContextImpl would announce what it writes as a change by the user.
  */
-class ComputeVectors : public ContextVectors {
+class ComputeVectors : public HostContext {
 public:
-    explicit ComputeVectors(OpenMM::ContextImpl& context);
+    ComputeVectors(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator);
     const Vectors& getPositions() override;
     const Vectors& getVelocities() override;
     Vectors& getForces() override;
@@ -34,7 +34,6 @@ public:
     }
 
 private:
-    OpenMM::ContextImpl& context;
     OpenMM::Kernel kernel;
     Vectors positions, velocities, forces;
     OpenMM::Vec3 box[3];

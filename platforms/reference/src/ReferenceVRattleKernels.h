@@ -4,9 +4,9 @@
 #ifndef OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 #define OPENMMVRATTLE_REFERENCEVRATTLEKERNELS_H_
 
-#include "HostRunDevice.h"
 #include "ReferenceVectors.h"
 #include "openmmvrattle/VRattleKernels.h"
+#include "run/HostRunDevice.h"
 #include <functional>
 #include <memory>
 
@@ -21,25 +21,24 @@ public:
     }
     RunDevice& initialize(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
                           const IntegratorSettings& settings) override {
-        device = makeHostRunDevice(context, std::make_unique<ReferenceVectors>(data), integrator, settings);
-        if (getPlatform().getName() != "Reference") { // which does everything on one thread
-            // This thread is awake and takes the share of the pool's first.
-            auto runOnThreads = [this](const std::function<void(int)>& task) {
-                data.threads.execute([&task](OpenMM::ThreadPool&, int thread) {
-                    if (thread > 0)
-                        task(thread);
-                });
-                task(0);
-                data.threads.waitForThreads();
-            };
-            device->setParallel(runOnThreads, data.threads.getNumThreads());
-        }
+        // This thread is awake and takes the share of the pool's first.
+        auto runOnThreads = [this](const std::function<void(int)>& task) {
+            data.threads.execute([&task](OpenMM::ThreadPool&, int thread) {
+                if (thread > 0)
+                    task(thread);
+            });
+            task(0);
+            data.threads.waitForThreads();
+        };
+        const bool hasThreads = getPlatform().getName() != "Reference"; // which does everything on one
+        device = makeHostRunDevice(std::make_unique<ReferenceVectors>(context, integrator, data), context.getSystem(),
+                                   settings, runOnThreads, hasThreads ? data.threads.getNumThreads() : 1);
         return *device;
     }
 
 private:
     OpenMM::ReferencePlatform::PlatformData& data;
-    std::unique_ptr<HostRunDevice> device;
+    std::unique_ptr<RunDevice> device;
 };
 
 } // namespace OpenMMVRattle

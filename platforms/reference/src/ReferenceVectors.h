@@ -4,15 +4,16 @@
 #ifndef OPENMMVRATTLE_REFERENCEVECTORS_H_
 #define OPENMMVRATTLE_REFERENCEVECTORS_H_
 
-#include "ContextVectors.h"
+#include "HostContext.h"
 #include "openmm/reference/ReferencePlatform.h"
 
 namespace OpenMMVRattle {
 
 /** The state of a Context on the Reference platform and those derived from it, which have it as vectors. */
-class ReferenceVectors : public ContextVectors {
+class ReferenceVectors : public HostContext {
 public:
-    explicit ReferenceVectors(OpenMM::ReferencePlatform::PlatformData& data) : data(data) {
+    ReferenceVectors(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
+                     OpenMM::ReferencePlatform::PlatformData& data) : HostContext(context, integrator), data(data) {
     }
     const Vectors& getPositions() override {
         return *data.positions;

@@ -4,29 +4,39 @@
 #ifndef OPENMMVRATTLE_HOSTRUNDEVICE_H_
 #define OPENMMVRATTLE_HOSTRUNDEVICE_H_
 
-#include "ContextVectors.h"
-#include "ForceReach.h"
-#include "openmm/Integrator.h"
-#include "openmm/internal/ContextImpl.h"
+#include "constraints/SharedWork.h"
+#include "expressions/ExpressionGroup.h"
+#include "openmm/System.h"
+#include "run/ContextVectors.h"
+#include "run/ForceReach.h"
 #include "run/RunDevice.h"
-#include "step/Dynamics.h"
 #include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * A device that computes on the host: it moves data between the vectors of a Context and a method of integration (Dynamics), and
- * asks for the forces. What is particular to a method is in the classes derived from this one, which are all there is to Reference and
+ * A device that computes on the host: it moves data between the vectors of a Context and a method of integration, and asks for the
+ * forces. What is particular to a method is in the classes derived from this one, which are all that a run needs on Reference and
  * the platforms derived from it; on a GPU they do what is rare, such as starts.
+ *
+ * A method computes no forces. A step of it is one or more passes of two halves, around an evaluation of the forces each:
+ *
+ *     do {
+ *         method.step(maxStep);                              // new positions, getNextPositions()
+ *         ... compute the forces there ...
+ *     } while (!method.finish(forces, groupEnergy));         // the step is complete: new positions, velocities, forces
+ *
+ * Until finish() has returned true, the state before the step is untouched. What else there is to a method: VRattleDynamics.
  */
-class HostRunDevice : public RunDevice {
+template <class Method> class HostRunDevice : public RunDevice {
 public:
-    HostRunDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
-                  const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
-    /** Let threads share the work; see Dynamics::setParallel(). */
-    void setParallel(const Dynamics::Parallel& parallel, int numThreads) {
-        dynamics->setParallel(parallel, numThreads);
+    /** @param system    must live as long as this */
+    HostRunDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
+                  const IntegratorSettings& settings);
+    /** Let threads share the work where that is faster. */
+    void setParallel(const SharedWork::Parallel& parallel, int numThreads) {
+        method.setParallel(parallel, numThreads);
     }
     void setSettings(const IntegratorSettings& settings) override;
     std::vector<double> getReferences() override;
@@ -54,20 +64,18 @@ public:
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
-    typedef std::vector<OpenMM::Vec3> Vectors;
+    typedef ContextVectors::Vectors Vectors;
     /** An on-step state that satisfies the constraints. */
     struct State {
         const Vectors &positions, &velocities, &forces;
         double groupEnergy;
     };
     /** Give the method its settings, but for the parameters of expressions. */
-    virtual void setDynamics(const IntegratorSettings& settings) = 0;
+    virtual void setMethod(const IntegratorSettings& settings) = 0;
     /** Write down what the method goes on with beside the state. */
-    virtual void saveDynamics(RunState& run) = 0;
+    virtual void saveMethod(RunState& run) = 0;
     /** Let the method go on from a saved run. */
-    virtual void resumeDynamics(const State& state, const RunState& run, const IntegratorSettings& saved) = 0;
-    /** Those of the System. */
-    std::vector<DistanceConstraint> getConstraints() const;
+    virtual void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) = 0;
     /** The Context, where it is not in the method's state: as the user or a Force has left it, until a step is complete. */
     struct Ahead {
         Vectors positions, velocities;
@@ -85,17 +93,16 @@ protected:
     }
     std::vector<double> sumPositions();
     /** Whether two sets of positions or velocities are others, for the particles that move. */
-    virtual bool differ(const Vectors& a, const Vectors& b) const;
+    virtual bool differ(const Vectors& a, const Vectors& b);
     void writeMovingPositions(const Vectors& positions);
     void writeMovingVelocities(const Vectors& velocities);
-    void copyMoving(const Vectors& from, Vectors& to) const;
-    OpenMM::ContextImpl& context;
+    void copyMoving(const Vectors& from, Vectors& to);
     std::unique_ptr<ContextVectors> vectors;
-    const OpenMM::Integrator& integrator;
+    const OpenMM::System& system;
     std::vector<double> masses;
     std::vector<char> isVirtualSite;
     std::vector<ExpressionConstraint> expressions;
-    std::unique_ptr<Dynamics> dynamics; // which the derived class makes
+    Method method;
     int forceGroups, monitorForceGroup;
     bool hasMassless;
     ForceReach reach;
@@ -105,10 +112,14 @@ protected:
     long long numForceEvaluations;
 };
 
-/** The device for the method that the settings ask for. */
-std::unique_ptr<HostRunDevice> makeHostRunDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
-                                                 const OpenMM::Integrator& integrator,
-                                                 const IntegratorSettings& settings);
+/**
+ * The device for the method that the settings ask for.
+ *
+ * @param parallel    runs a task on several threads; or empty
+ */
+std::unique_ptr<RunDevice> makeHostRunDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
+                                             const IntegratorSettings& settings,
+                                             const SharedWork::Parallel& parallel = {}, int numThreads = 1);
 
 } // namespace OpenMMVRattle
 

@@ -4,7 +4,8 @@
 #ifndef OPENMMVRATTLE_HOSTVRATTLEDEVICE_H_
 #define OPENMMVRATTLE_HOSTVRATTLEDEVICE_H_
 
-#include "HostRunDevice.h"
+#include "run/HostRunDevice.h"
+#include "run/RunState.h"
 #include "step/VRattleDynamics.h"
 #include <memory>
 #include <vector>
@@ -12,10 +13,10 @@
 namespace OpenMMVRattle {
 
 /** The device of VariableStepRattleIntegrator: the method is VRattleDynamics. */
-class HostVRattleDevice : public HostRunDevice {
+class HostVRattleDevice : public HostRunDevice<VRattleDynamics> {
 public:
-    HostVRattleDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
-                      const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    HostVRattleDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
+                      const IntegratorSettings& settings);
     void beginTrial(double stepSize, bool isBackwards) override;
     void takeTrialStep() override;
     void endTrial() override;
@@ -26,11 +27,13 @@ public:
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
 
 protected:
-    void setDynamics(const IntegratorSettings& settings) override;
-    void saveDynamics(RunState& run) override;
-    void resumeDynamics(const State& state, const RunState& run, const IntegratorSettings& saved) override;
+    void setMethod(const IntegratorSettings& settings) override;
+    void saveMethod(RunState& run) override;
+    void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) override;
+    void exchange(VRattleDynamics::Memory& memory, RunState::Archive archive, size_t numMonitors,
+                  bool isAutomatic) const;
     VRattleDynamics::Memory memoryOf(const RunState& run, const IntegratorSettings& saved) const;
-    VRattleDynamics& vrattle; // the method
+    VRattleDynamics& vrattle = method;
     VRattleDynamics::Settings settings;
     /** A trial run, and what is to be put back after it. */
     struct Trial {

@@ -1,7 +1,7 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "ForceReach.h"
+#include "run/ForceReach.h"
 #include "openmm/AndersenThermostat.h"
 #include "openmm/CMAPTorsionForce.h"
 #include "openmm/CMMotionRemover.h"

@@ -5,11 +5,16 @@
 #define OPENMMVRATTLE_CONTEXTVECTORS_H_
 
 #include "openmm/Vec3.h"
+#include <map>
+#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
 
-/** The state of a Context, wherever the platform has it, read and written as vectors of the host, without announcing a change. */
+/**
+ * All that a device on the host needs of a Context: its state, wherever the platform has it, read and written as vectors of the host
+ * without announcing a change, and what can be computed there.
+ */
 class ContextVectors {
 public:
     typedef std::vector<OpenMM::Vec3> Vectors;
@@ -34,6 +39,24 @@ public:
     virtual void setTime(double time) = 0;
     virtual long long getStepCount() = 0;
     virtual void setStepCount(long long count) = 0;
+
+    /** The parameters of Forces. */
+    virtual const std::map<std::string, double>& getParameters() = 0;
+    /** Whether the integrator is one of several that take steps in the Context. */
+    virtual bool isSharedByIntegrators() = 0;
+    /** Let the Forces that act between steps do so; returns whether one of them says that the forces are no longer valid. */
+    virtual bool updateState() = 0;
+    /** Throw an OpenMMException if nobody has set positions. */
+    virtual void requirePositions() = 0;
+    virtual void computeVirtualSites() = 0;
+    /**
+     * Compute the forces of some groups, a bit for each.
+     *
+     * @param energyGroup    a group whose energy is wanted, or NO_GROUP
+     * @return that energy
+     */
+    virtual double computeForces(int groups, int energyGroup) = 0;
+    static constexpr int NO_GROUP = -1;
 };
 
 } // namespace OpenMMVRattle

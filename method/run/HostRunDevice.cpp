@@ -1,11 +1,11 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-#include "HostRunDevice.h"
-#include "HostLangevinDevice.h"
-#include "HostVRattleDevice.h"
+#include "run/HostRunDevice.h"
 #include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
+#include "run/HostLangevinDevice.h"
+#include "run/HostVRattleDevice.h"
 #include "run/IntegratorSettings.h"
 #include "run/RunState.h"
 #include "run/StartCheck.h"
@@ -16,7 +16,6 @@
 #include <random>
 
 using namespace OpenMMVRattle;
-using OpenMM::ContextImpl;
 using OpenMM::OpenMMException;
 using OpenMM::System;
 using OpenMM::Vec3;
@@ -24,7 +23,7 @@ using std::vector;
 
 namespace {
 
-const int NO_MONITOR_GROUP = -1, NUM_POSITION_SUMS = 8;
+const int NUM_POSITION_SUMS = 8;
 // Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
 const double FORCE_ROUNDING = 1e-4;
 
@@ -59,36 +58,14 @@ bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
     return true;
 }
 
-} // namespace
-
-std::unique_ptr<HostRunDevice> OpenMMVRattle::makeHostRunDevice(ContextImpl& context,
-                                                                std::unique_ptr<ContextVectors> vectors,
-                                                                const OpenMM::Integrator& integrator,
-                                                                const IntegratorSettings& settings) {
-    if (settings.langevin)
-        return std::make_unique<HostLangevinDevice>(context, std::move(vectors), integrator, settings);
-    return std::make_unique<HostVRattleDevice>(context, std::move(vectors), integrator, settings);
+vector<double> massesOf(const System& system) {
+    vector<double> masses;
+    for (int i = 0; i < system.getNumParticles(); i++)
+        masses.push_back(system.getParticleMass(i));
+    return masses;
 }
 
-HostRunDevice::HostRunDevice(ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
-                             const OpenMM::Integrator& integrator, const IntegratorSettings& integratorSettings) :
-        context(context), vectors(std::move(vectors)), integrator(integrator),
-        expressions(integratorSettings.expressions), forceGroups(0), monitorForceGroup(NO_MONITOR_GROUP),
-        lastStep{0.0, 1.0}, numForceEvaluations(0) {
-    const System& system = context.getSystem();
-    masses.resize(system.getNumParticles());
-    for (int i = 0; i < system.getNumParticles(); i++)
-        masses[i] = system.getParticleMass(i);
-    isVirtualSite.resize(system.getNumParticles());
-    for (int i = 0; i < system.getNumParticles(); i++)
-        isVirtualSite[i] = system.isVirtualSite(i);
-    hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
-    for (int i = 0; i < system.getNumForces(); i++)
-        reach.add(system.getForce(i));
-}
-
-vector<DistanceConstraint> HostRunDevice::getConstraints() const {
-    const System& system = context.getSystem();
+vector<DistanceConstraint> constraintsOf(const System& system) {
     vector<DistanceConstraint> constraints(system.getNumConstraints());
     for (int i = 0; i < system.getNumConstraints(); i++) {
         DistanceConstraint& c = constraints[i];
@@ -97,42 +74,70 @@ vector<DistanceConstraint> HostRunDevice::getConstraints() const {
     return constraints;
 }
 
+} // namespace
+
+std::unique_ptr<RunDevice> OpenMMVRattle::makeHostRunDevice(std::unique_ptr<ContextVectors> vectors,
+                                                            const System& system, const IntegratorSettings& settings,
+                                                            const SharedWork::Parallel& parallel, int numThreads) {
+    auto make = [&](auto device) -> std::unique_ptr<RunDevice> {
+        if (parallel)
+            device->setParallel(parallel, numThreads);
+        return device;
+    };
+    if (settings.langevin)
+        return make(std::make_unique<HostLangevinDevice>(std::move(vectors), system, settings));
+    return make(std::make_unique<HostVRattleDevice>(std::move(vectors), system, settings));
+}
+
+template <class Method>
+HostRunDevice<Method>::HostRunDevice(std::unique_ptr<ContextVectors> vectors, const System& system,
+                                     const IntegratorSettings& settings) :
+        vectors(std::move(vectors)), system(system), masses(massesOf(system)), expressions(settings.expressions),
+        method(masses, constraintsOf(system), expressions), forceGroups(0), monitorForceGroup(ContextVectors::NO_GROUP),
+        lastStep{0.0, 1.0}, numForceEvaluations(0) {
+    for (int i = 0; i < system.getNumParticles(); i++)
+        isVirtualSite.push_back(system.isVirtualSite(i));
+    hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
+    for (int i = 0; i < system.getNumForces(); i++)
+        reach.add(system.getForce(i));
+}
+
 // -------------------------------------------------------------------------------------------------------- the settings
 
-void HostRunDevice::setSettings(const IntegratorSettings& from) {
-    setDynamics(from);
+template <class Method> void HostRunDevice<Method>::setSettings(const IntegratorSettings& from) {
+    setMethod(from);
     forceGroups = from.getActingForceGroups();
-    monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : NO_MONITOR_GROUP;
+    monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
     for (size_t i = 0; i < expressions.size(); i++)
         if (expressions[i].parameters != from.expressions[i].parameters) {
             expressions[i].parameters = from.expressions[i].parameters;
-            dynamics->setParameters((int) i, expressions[i].parameters);
+            method.setParameters((int) i, expressions[i].parameters);
         }
 }
 
-vector<double> HostRunDevice::getReferences() {
-    return dynamics->getReferences();
+template <class Method> vector<double> HostRunDevice<Method>::getReferences() {
+    return method.getReferences();
 }
 
-void HostRunDevice::setReferences(const vector<double>& references) {
-    dynamics->setReferences(references);
+template <class Method> void HostRunDevice<Method>::setReferences(const vector<double>& references) {
+    method.setReferences(references);
 }
 
 // ------------------------------------------------------------------------------------------ what happens to the Context
 
-bool HostRunDevice::updateState() {
-    return context.updateContextState();
+template <class Method> bool HostRunDevice<Method>::updateState() {
+    return vectors->updateState();
 }
 
-RunDevice::Change HostRunDevice::findChange() {
+template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
     const Vec3* box = vectors->getBoxVectors();
     const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
     std::copy(box, box + 3, boxVectors);
-    if (isOtherBox || dynamics->getPositions().empty())
+    if (isOtherBox || method.getPositions().empty())
         return Change::Box;
     // A look at all positions and velocities is spent only where it may find something: where a Force may have changed them, or
     // another integrator (of a CompoundIntegrator) may have taken steps.
-    const bool mustCompare = ahead != nullptr || &context.getIntegrator() != &integrator;
+    const bool mustCompare = ahead != nullptr || vectors->isSharedByIntegrators();
     if ((mustCompare || reach.isUnknown || reach.hasBarostat) && differ(vectors->getPositions(), knownPositions()))
         return Change::State;
     if ((mustCompare || reach.isUnknown || reach.hasBarostat || reach.hasThermostat || reach.movesFrame) &&
@@ -141,7 +146,7 @@ RunDevice::Change HostRunDevice::findChange() {
     return Change::None;
 }
 
-unsigned long long HostRunDevice::getFingerprint() {
+template <class Method> unsigned long long HostRunDevice<Method>::getFingerprint() {
     const Vectors& velocities = vectors->getVelocities();
     Fingerprint fingerprint;
     // In the digits that every platform keeps, so that it knows a state again that comes from another one. Positions change by rounding
@@ -156,7 +161,7 @@ unsigned long long HostRunDevice::getFingerprint() {
 }
 
 // Some sums of all positions with signs by chance, the same everywhere: whoever moves particles changes them.
-vector<double> HostRunDevice::sumPositions() {
+template <class Method> vector<double> HostRunDevice<Method>::sumPositions() {
     vector<double> sums(NUM_POSITION_SUMS, 0.0);
     std::minstd_rand random;
     const Vectors& positions = vectors->getPositions();
@@ -169,69 +174,69 @@ vector<double> HostRunDevice::sumPositions() {
     return sums;
 }
 
-unsigned long long HostRunDevice::getParameterFingerprint() {
+template <class Method> unsigned long long HostRunDevice<Method>::getParameterFingerprint() {
     Fingerprint fingerprint;
-    for (const auto& parameter : context.getParameters()) {
+    for (const auto& parameter : vectors->getParameters()) {
         fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
         fingerprint.add(parameter.second);
     }
     return fingerprint.get();
 }
 
-void HostRunDevice::start() {
+template <class Method> void HostRunDevice<Method>::start() {
     const Vec3* box = vectors->getBoxVectors();
-    const bool hasBox = hasPeriodicBox(context.getSystem(), box);
+    const bool hasBox = hasPeriodicBox(system, box);
     const Vectors before = vectors->getPositions();
-    const std::function<void()> putBackDynamics = dynamics->remember();
+    const std::function<void()> putBackMethod = method.remember();
     try {
-        dynamics->adoptParameters();
-        requireSoundStart(dynamics->getConstraintSystem(),
+        method.adoptParameters();
+        requireSoundStart(method.getConstraintSystem(),
                           {vectors->getPositions(), vectors->getVelocities(), isVirtualSite, hasBox ? box : nullptr,
-                           dynamics->getParameters()});
-        context.computeVirtualSites(); // setPositions() leaves them where the user puts them
-        context.calcForcesAndEnergy(false, false, 0); // throws if no positions have been set, and computes nothing
+                           method.getParameters()});
+        vectors->computeVirtualSites(); // setPositions() leaves them where the user puts them
+        vectors->requirePositions();
         Vectors positions = vectors->getPositions(), forces;
-        dynamics->projectPositions(positions);
+        method.projectPositions(positions);
         const double energy = computeForcesAt(positions, forces);
-        dynamics->begin(positions, vectors->getVelocities(), forces, energy);
+        method.begin(positions, vectors->getVelocities(), forces, energy);
     }
     catch (...) {
         vectors->setPositions(before);
-        putBackDynamics();
+        putBackMethod();
         throw;
     }
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void HostRunDevice::changeState() {
+template <class Method> void HostRunDevice<Method>::changeState() {
     Vectors positions = vectors->getPositions(), forces;
-    dynamics->projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
+    method.projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
     const double energy = computeForcesAt(positions, forces);
-    dynamics->changeState(positions, vectors->getVelocities(), forces, energy);
+    method.changeState(positions, vectors->getVelocities(), forces, energy);
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void HostRunDevice::changeVelocities() {
-    if (ahead == nullptr && dynamics->changeFrame(vectors->getVelocities()))
+template <class Method> void HostRunDevice<Method>::changeVelocities() {
+    if (ahead == nullptr && method.changeFrame(vectors->getVelocities()))
         return;
-    dynamics->changeVelocities(vectors->getVelocities());
+    method.changeVelocities(vectors->getVelocities());
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
 }
 
-void HostRunDevice::writeVelocities() {
-    writeMovingVelocities(dynamics->getVelocities());
+template <class Method> void HostRunDevice<Method>::writeVelocities() {
+    writeMovingVelocities(method.getVelocities());
     if (ahead != nullptr)
         ahead->velocities = vectors->getVelocities();
 }
 
-void HostRunDevice::changeForces() {
+template <class Method> void HostRunDevice<Method>::changeForces() {
     Vectors forces;
-    const double energy = computeForcesAt(dynamics->getPositions(), forces);
-    dynamics->changeForces(forces, energy);
+    const double energy = computeForcesAt(method.getPositions(), forces);
+    method.changeForces(forces, energy);
 }
 
 // The forces at positions that may not be those of the Context, which keeps its own; returns the energy of the monitor's group.
-double HostRunDevice::computeForcesAt(const Vectors& positions, Vectors& forces) {
+template <class Method> double HostRunDevice<Method>::computeForcesAt(const Vectors& positions, Vectors& forces) {
     const bool isElsewhere = differ(vectors->getPositions(), positions);
     const Vectors before = isElsewhere ? vectors->getPositions() : Vectors();
     auto putBack = [&] {
@@ -242,7 +247,7 @@ double HostRunDevice::computeForcesAt(const Vectors& positions, Vectors& forces)
     try {
         if (isElsewhere) {
             writeMovingPositions(positions);
-            context.computeVirtualSites();
+            vectors->computeVirtualSites();
         }
         energy = computeForces();
     }
@@ -255,27 +260,24 @@ double HostRunDevice::computeForcesAt(const Vectors& positions, Vectors& forces)
     return energy;
 }
 
-double HostRunDevice::computeForces() {
-    // The energy first: some platforms use up the forces for it.
-    const double energy =
-        monitorForceGroup == NO_MONITOR_GROUP ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << monitorForceGroup);
-    context.calcForcesAndEnergy(true, false, forceGroups);
+template <class Method> double HostRunDevice<Method>::computeForces() {
+    const double energy = vectors->computeForces(forceGroups, monitorForceGroup);
     numForceEvaluations++;
     return energy;
 }
 
-const vector<Vec3>& HostRunDevice::knownPositions() const {
-    return ahead != nullptr ? ahead->positions : dynamics->getPositions();
+template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownPositions() const {
+    return ahead != nullptr ? ahead->positions : method.getPositions();
 }
 
-const vector<Vec3>& HostRunDevice::knownVelocities() const {
-    return ahead != nullptr ? ahead->velocities : dynamics->getVelocities();
+template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownVelocities() const {
+    return ahead != nullptr ? ahead->velocities : method.getVelocities();
 }
 
 // Particles of mass zero are not the integrator's to move: they are virtual sites, or fixed.
-bool HostRunDevice::differ(const Vectors& a, const Vectors& b) const {
+template <class Method> bool HostRunDevice<Method>::differ(const Vectors& a, const Vectors& b) {
     std::atomic<bool> areSame(true);
-    dynamics->share((int) masses.size(), [&](int first, int end) {
+    method.share((int) masses.size(), [&](int first, int end) {
         for (int i = first; i < end && areSame; i++)
             if (masses[i] > 0 && a[i] != b[i])
                 areSame = false;
@@ -283,7 +285,7 @@ bool HostRunDevice::differ(const Vectors& a, const Vectors& b) const {
     return !areSame;
 }
 
-void HostRunDevice::writeMovingPositions(const Vectors& positions) {
+template <class Method> void HostRunDevice<Method>::writeMovingPositions(const Vectors& positions) {
     if (Vectors* storage = vectors->accessPositions())
         copyMoving(positions, *storage);
     else if (!hasMassless)
@@ -295,7 +297,7 @@ void HostRunDevice::writeMovingPositions(const Vectors& positions) {
     }
 }
 
-void HostRunDevice::writeMovingVelocities(const Vectors& velocities) {
+template <class Method> void HostRunDevice<Method>::writeMovingVelocities(const Vectors& velocities) {
     if (Vectors* storage = vectors->accessVelocities())
         copyMoving(velocities, *storage);
     else if (!hasMassless)
@@ -307,8 +309,8 @@ void HostRunDevice::writeMovingVelocities(const Vectors& velocities) {
     }
 }
 
-void HostRunDevice::copyMoving(const Vectors& from, Vectors& to) const {
-    dynamics->share((int) masses.size(), [&](int first, int end) {
+template <class Method> void HostRunDevice<Method>::copyMoving(const Vectors& from, Vectors& to) {
+    method.share((int) masses.size(), [&](int first, int end) {
         for (int i = first; i < end; i++)
             if (masses[i] > 0)
                 to[i] = from[i];
@@ -318,20 +320,20 @@ void HostRunDevice::copyMoving(const Vectors& from, Vectors& to) const {
 // ----------------------------------------------------------------------------------------------------------- the steps
 
 // One step of the method in the Context, the velocities excepted. Forces see the time of its end.
-double HostRunDevice::advance(double maxTime, double direction) {
+template <class Method> double HostRunDevice<Method>::advance(double maxTime, double direction) {
     const double time = vectors->getTime(), maxStep = maxTime - time;
     while (true) {
-        const double size = dynamics->step(maxStep);
+        const double size = method.step(maxStep);
         vectors->setTime(size < maxStep ? time + direction * size : maxTime);
-        writeMovingPositions(dynamics->getNextPositions());
-        context.computeVirtualSites();
+        writeMovingPositions(method.getNextPositions());
+        vectors->computeVirtualSites();
         const double energy = computeForces();
-        if (dynamics->finish(vectors->getForces(), energy))
+        if (method.finish(vectors->getForces(), energy))
             return size;
     }
 }
 
-void HostRunDevice::step(double maxTime) {
+template <class Method> void HostRunDevice<Method>::step(double maxTime) {
     const double time = vectors->getTime();
     const long long count = vectors->getStepCount();
     try {
@@ -341,31 +343,31 @@ void HostRunDevice::step(double maxTime) {
     catch (...) {
         vectors->setTime(time);
         vectors->setStepCount(count);
-        dynamics->abandonStep();
+        method.abandonStep();
         putBack();
         throw;
     }
-    lastStep.density = dynamics->getDensity();
-    writeMovingVelocities(dynamics->getVelocities());
+    lastStep.density = method.getDensity();
+    writeMovingVelocities(method.getVelocities());
     ahead.reset();
 }
 
-void HostRunDevice::settle() {
+template <class Method> void HostRunDevice<Method>::settle() {
 }
 
 // The positions of the Context before a step.
-void HostRunDevice::putBack() {
+template <class Method> void HostRunDevice<Method>::putBack() {
     if (ahead != nullptr) {
         vectors->setPositions(ahead->positions);
         return;
     }
-    writeMovingPositions(dynamics->getPositions());
-    context.computeVirtualSites();
+    writeMovingPositions(method.getPositions());
+    vectors->computeVirtualSites();
 }
 
-void HostRunDevice::reverse() {
-    dynamics->reverse();
-    lastStep.density = dynamics->getDensity();
+template <class Method> void HostRunDevice<Method>::reverse() {
+    method.reverse();
+    lastStep.density = method.getDensity();
     Vectors velocities = vectors->getVelocities();
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0)
@@ -375,27 +377,27 @@ void HostRunDevice::reverse() {
         ahead->velocities = velocities;
 }
 
-RunDevice::LastStep HostRunDevice::getLastStep() {
+template <class Method> RunDevice::LastStep HostRunDevice<Method>::getLastStep() {
     return lastStep;
 }
 
-double HostRunDevice::getTime() {
+template <class Method> double HostRunDevice<Method>::getTime() {
     return vectors->getTime();
 }
 
-long long HostRunDevice::getStepCount() {
+template <class Method> long long HostRunDevice<Method>::getStepCount() {
     return vectors->getStepCount();
 }
 
 // ------------------------------------------------------------------------------------------------------------- numbers
 
-vector<double> HostRunDevice::getMultipliers() {
+template <class Method> vector<double> HostRunDevice<Method>::getMultipliers() {
     vector<double> result;
-    dynamics->getConstraintSystem().getGivenMultipliers(dynamics->getMultipliers(), result);
+    method.getConstraintSystem().getGivenMultipliers(method.getMultipliers(), result);
     return result;
 }
 
-double HostRunDevice::computeKineticEnergy() {
+template <class Method> double HostRunDevice<Method>::computeKineticEnergy() {
     double sum = 0;
     for (size_t i = 0; i < masses.size(); i++)
         if (masses[i] > 0) // the velocities of the others have no meaning, and may be no numbers
@@ -403,26 +405,26 @@ double HostRunDevice::computeKineticEnergy() {
     return 0.5 * sum;
 }
 
-long long HostRunDevice::getNumForceEvaluations() {
+template <class Method> long long HostRunDevice<Method>::getNumForceEvaluations() {
     return numForceEvaluations;
 }
 
-long long HostRunDevice::getNumSolverIterations() {
-    return dynamics->getNumIterations();
+template <class Method> long long HostRunDevice<Method>::getNumSolverIterations() {
+    return method.getNumIterations();
 }
 
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
-void HostRunDevice::save(RunState& run) {
-    saveDynamics(run);
+template <class Method> void HostRunDevice<Method>::save(RunState& run) {
+    saveMethod(run);
     run.methodValues["positionSums"] = sumPositions();
-    run.forces = dynamics->getForces();
-    run.groupEnergy = dynamics->getGroupEnergy();
+    run.forces = method.getForces();
+    run.groupEnergy = method.getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
-    if (differ(vectors->getPositions(), dynamics->getPositions()))
-        run.positions = dynamics->getPositions();
-    if (differ(vectors->getVelocities(), dynamics->getVelocities()))
-        run.velocities = dynamics->getVelocities();
+    if (differ(vectors->getPositions(), method.getPositions()))
+        run.positions = method.getPositions();
+    if (differ(vectors->getVelocities(), method.getVelocities()))
+        run.velocities = method.getVelocities();
     run.isContextAhead = ahead != nullptr;
     if (ahead != nullptr && differ(vectors->getPositions(), ahead->positions))
         run.contextPositions = ahead->positions;
@@ -430,7 +432,8 @@ void HostRunDevice::save(RunState& run) {
         run.contextVelocities = ahead->velocities;
 }
 
-bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
+template <class Method>
+bool HostRunDevice<Method>::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     const vector<double> sums = sumPositions(), &savedSums = run.getMethodValues("positionSums", NUM_POSITION_SUMS);
     const double largest = 4 * getPositionRounding() * std::sqrt(3.0 * masses.size());
     for (int k = 0; k < NUM_POSITION_SUMS; k++)
@@ -445,7 +448,7 @@ bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved,
     const double larger = std::max(std::fabs(energy), std::fabs(run.groupEnergy));
     if (!agree(forces, run.forces) || !(std::fabs(energy - run.groupEnergy) <= FORCE_ROUNDING * larger))
         return false;
-    resumeDynamics({positions, velocities, forces, energy}, run, saved);
+    resumeMethod({positions, velocities, forces, energy}, run, saved);
     ahead.reset();
     if (run.isContextAhead)
         ahead.reset(new Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,
@@ -453,3 +456,6 @@ bool HostRunDevice::resume(const RunState& run, const IntegratorSettings& saved,
     std::copy(run.boxVectors, run.boxVectors + 3, boxVectors);
     return true;
 }
+
+template class OpenMMVRattle::HostRunDevice<VRattleDynamics>;
+template class OpenMMVRattle::HostRunDevice<LangevinDynamics>;

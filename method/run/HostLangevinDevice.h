@@ -4,7 +4,8 @@
 #ifndef OPENMMVRATTLE_HOSTLANGEVINDEVICE_H_
 #define OPENMMVRATTLE_HOSTLANGEVINDEVICE_H_
 
-#include "HostRunDevice.h"
+#include "run/HostRunDevice.h"
+#include "run/RunState.h"
 #include "step/LangevinDynamics.h"
 #include <memory>
 #include <vector>
@@ -12,10 +13,10 @@
 namespace OpenMMVRattle {
 
 /** The device of VariableStepRattleLangevinIntegrator: the method is LangevinDynamics. */
-class HostLangevinDevice : public HostRunDevice {
+class HostLangevinDevice : public HostRunDevice<LangevinDynamics> {
 public:
-    HostLangevinDevice(OpenMM::ContextImpl& context, std::unique_ptr<ContextVectors> vectors,
-                       const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    HostLangevinDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
+                       const IntegratorSettings& settings);
     std::vector<double> getMonitorValues() override;
     double computeHalfStepKineticEnergy() override;
     long long getNumSubstepped() override;
@@ -25,13 +26,14 @@ public:
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
 
 protected:
-    void setDynamics(const IntegratorSettings& settings) override;
-    void saveDynamics(RunState& run) override;
-    void resumeDynamics(const State& state, const RunState& run, const IntegratorSettings& saved) override;
+    void setMethod(const IntegratorSettings& settings) override;
+    void saveMethod(RunState& run) override;
+    void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) override;
+    LangevinDynamics& langevin = method;
 
 private:
+    void exchange(LangevinDynamics::Memory& memory, RunState::Archive archive) const;
     LangevinDynamics::Memory memoryOf(const RunState& run) const;
-    LangevinDynamics& langevin; // the method
 };
 
 } // namespace OpenMMVRattle
