@@ -5,6 +5,7 @@
 #include "ComputeVectors.h"
 #include "constraints/StepFailure.h"
 #include "openmm/common/ContextSelector.h"
+#include "run/HostVRattleDevice.h"
 #include "run/IntegratorSettings.h"
 #include <algorithm>
 #include <cmath>
@@ -39,10 +40,11 @@ private:
 
 } // namespace
 
-CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
-                                 const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
-        HostVRattleDevice(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings),
-        context(context), compute(compute), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
+template <class Host>
+CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
+                                       const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
+        Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
+        compute(compute), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
         areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
         lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
         writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
@@ -55,12 +57,12 @@ CommonRunDevice::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeCo
 
 // ------------------------------------------------------------------------------------------------ from one to the other
 
-int CommonRunDevice::getNumWrites() const {
+template <class Host> int CommonRunDevice<Host>::getNumWrites() const {
     return static_cast<const ComputeVectors&>(*vectors).getNumWrites();
 }
 
-double CommonRunDevice::computeForces() {
-    groupEnergy = HostRunDevice::computeForces();
+template <class Host> double CommonRunDevice<Host>::computeForces() {
+    groupEnergy = Host::computeForces();
     hasForces = true;
     writeCount = getNumWrites();
     if (areAtomsReordered)
@@ -70,7 +72,7 @@ double CommonRunDevice::computeForces() {
 }
 
 // OpenMM has the inverse masses beside the velocities, and Context::reinitialize() brings old ones back with these.
-void CommonRunDevice::correctMasses() {
+template <class Host> void CommonRunDevice<Host>::correctMasses() {
     ContextSelector selector(compute);
     auto correct = [&](auto& velocities) {
         compute.getVelm().download(velocities);
@@ -97,67 +99,54 @@ void CommonRunDevice::correctMasses() {
 
 // Whether the forces are those of the present state. Others may have computed them again, with an energy. A barostat that rejects a
 // move puts forces and the order of the atoms back.
-bool CommonRunDevice::areForcesValid() {
+template <class Host> bool CommonRunDevice<Host>::areForcesValid() {
     return hasForces && writeCount == getNumWrites() && context.getLastForceGroups() == forceGroups &&
            (!areAtomsReordered || compute.getAtomIndex() == order);
 }
 
-void CommonRunDevice::ensureForces() {
+template <class Host> void CommonRunDevice<Host>::ensureForces() {
     if (!areForcesValid())
         computeForces();
 }
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
-bool CommonRunDevice::canStepOnDevice() {
-    if (steps == nullptr || reach.isUnknown || settings.isAutomatic || ahead != nullptr || !vrattle.hasStarted())
-        return false;
-    const vector<double> references = vrattle.getReferences();
-    return std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
+template <class Host> bool CommonRunDevice<Host>::canStepOnDevice() {
+    return steps != nullptr && !reach.isUnknown && ahead == nullptr && canGoOnDevice();
 }
 
 // The state goes to the device, where positions, velocities and forces are.
-void CommonRunDevice::beginOnDevice() {
+template <class Host> void CommonRunDevice<Host>::beginOnDevice() {
     ensureForces();
-    if (!areSettingsOnDevice) {
-        vector<StepMonitor::Term> terms = settings.terms;
-        const vector<double> references = vrattle.getReferences();
-        for (size_t k = 0; k < terms.size(); k++)
-            terms[k].reference = references[k];
-        steps->setSettings({settings.stepSize,
-                            StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
-                            settings.update, settings.isFixedStep, settings.tolerance, terms});
-        areSettingsOnDevice = true;
-    }
+    if (!areSettingsOnDevice)
+        steps->setSettings(makeDeviceSettings());
+    areSettingsOnDevice = true;
     hasBegun = steps->begin(state, groupEnergy);
     hasReport = false;
 }
 
 // The host gets the device's state as well.
-void CommonRunDevice::bringToHost() {
+template <class Host> void CommonRunDevice<Host>::bringToHost() {
     settle();
     if (isOnHost)
         return;
     ensureForces();
-    vrattle.adopt(vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy, state.density,
-                  state.hasHalfStepValue ? &state.halfStepValue : nullptr, state.densityOffset);
+    adopt({vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy}, state);
     isOnHost = true;
 }
 
 // And goes on with it.
-void CommonRunDevice::takeToHost() {
+template <class Host> void CommonRunDevice<Host>::takeToHost() {
     bringToHost();
     isOnDevice = false;
 }
 
 // ----------------------------------------------------------------------------------------------------------- the steps
 
-void CommonRunDevice::step(double maxTime) {
+template <class Host> void CommonRunDevice<Host>::step(double maxTime) {
     if (maxTime < NO_LIMIT)
         settle();
     if (!isOnDevice && canStepOnDevice()) {
-        const double halfStepValue = vrattle.findHalfStepValue();
-        const VRattleDynamics::Memory memory = vrattle.getMemory();
-        state = {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
+        state = makeDeviceState();
         isOnDevice = true;
         hasBegun = false;
     }
@@ -170,11 +159,11 @@ void CommonRunDevice::step(double maxTime) {
     if (isOnDevice)
         stepOnDevice(maxTime);
     else
-        HostRunDevice::step(maxTime);
+        Host::step(maxTime);
     knownCount = vectors->getStepCount();
 }
 
-void CommonRunDevice::stepOnDevice(double maxTime) {
+template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
     if (numAsked == 0) {
         settledTime = vectors->getTime();
         settledCount = vectors->getStepCount();
@@ -205,7 +194,7 @@ void CommonRunDevice::stepOnDevice(double maxTime) {
 }
 
 // Take note of what has become of the steps that were asked for.
-void CommonRunDevice::accept(const DeviceSteps::Report& report) {
+template <class Host> void CommonRunDevice<Host>::accept(const DeviceSteps::Report& report) {
     const bool areAllComplete = report.numSteps == numAsked;
     state = report.state;
     if (report.numSteps > 0)
@@ -222,7 +211,7 @@ void CommonRunDevice::accept(const DeviceSteps::Report& report) {
         hasForces = false;
 }
 
-void CommonRunDevice::settle() {
+template <class Host> void CommonRunDevice<Host>::settle() {
     while (numAsked > 0) {
         const int asked = numAsked;
         const DeviceSteps::Report report = steps->read();
@@ -234,7 +223,7 @@ void CommonRunDevice::settle() {
         // The step that failed is left to the host, which has other means, and says what is wrong if they fail too.
         context.computeVirtualSites();
         takeToHost();
-        HostRunDevice::step(lastMaxTime);
+        Host::step(lastMaxTime);
         for (int i = report.numSteps + 1; i < asked; i++)
             step(NO_LIMIT);
     }
@@ -242,7 +231,7 @@ void CommonRunDevice::settle() {
 
 // ------------------------------------------------------------------------------------------------------ what has changed
 
-void CommonRunDevice::setSettings(const IntegratorSettings& from) {
+template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSettings& from) {
     if (isOnDevice)
         takeToHost();
     IntegratorSettings possible = from;
@@ -250,27 +239,27 @@ void CommonRunDevice::setSettings(const IntegratorSettings& from) {
     static bool hasWarned = false;
     if (possible.constraintTolerance > from.constraintTolerance && !hasWarned) {
         hasWarned = true;
-        std::cerr << "VariableStepRattleIntegrator: the constraint tolerance " << from.constraintTolerance
+        std::cerr << from.getIntegratorName() << ": the constraint tolerance " << from.constraintTolerance
                   << " is below what the precision of this Context allows; " << possible.constraintTolerance
                   << " is used" << std::endl;
     }
-    HostRunDevice::setSettings(possible);
+    Host::setSettings(possible);
     areSettingsOnDevice = false;
 }
 
-void CommonRunDevice::setReferences(const vector<double>& references) {
+template <class Host> void CommonRunDevice<Host>::setReferences(const vector<double>& references) {
     if (isOnDevice)
         takeToHost();
-    HostRunDevice::setReferences(references);
+    Host::setReferences(references);
     areSettingsOnDevice = false;
 }
 
-bool CommonRunDevice::updateState() {
+template <class Host> bool CommonRunDevice<Host>::updateState() {
     // What changes positions must not find those of a step that has failed.
     if (reach.hasBarostat)
         settle();
     try {
-        return HostRunDevice::updateState();
+        return Host::updateState();
     }
     catch (...) {
         settle();
@@ -278,28 +267,28 @@ bool CommonRunDevice::updateState() {
     }
 }
 
-RunDevice::Change CommonRunDevice::findChange() {
+template <class Host> RunDevice::Change CommonRunDevice<Host>::findChange() {
     if (!isOnDevice || reach.isUnknown)
-        return HostRunDevice::findChange();
+        return Host::findChange();
     const OpenMM::Vec3* box = vectors->getBoxVectors();
     const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
     std::copy(box, box + 3, boxVectors);
     if (isOtherBox)
-        return Change::Box;
+        return RunDevice::Change::Box;
     // Another integrator (of a CompoundIntegrator) has taken steps.
     if (vectors->getStepCount() != knownCount)
-        return Change::State;
+        return RunDevice::Change::State;
     // A uniform motion is of no concern to constraints and their forces.
-    const bool doesFrameMatter = reach.movesFrame && StepProgram::usesSpeeds(settings.terms);
-    return reach.hasThermostat || doesFrameMatter ? Change::Velocities : Change::None;
+    const bool isOtherFrame = reach.movesFrame && doesFrameMatter();
+    return reach.hasThermostat || isOtherFrame ? RunDevice::Change::Velocities : RunDevice::Change::None;
 }
 
 // The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
-double CommonRunDevice::getPositionRounding() const {
+template <class Host> double CommonRunDevice<Host>::getPositionRounding() const {
     return compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
 }
 
-bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) {
+template <class Host> bool CommonRunDevice<Host>::differ(const Vectors& a, const Vectors& b) {
     const double tolerance = getPositionRounding();
     for (size_t i = 0; i < masses.size(); i++)
         for (int d = 0; d < 3; d++)
@@ -308,27 +297,27 @@ bool CommonRunDevice::differ(const Vectors& a, const Vectors& b) {
     return false;
 }
 
-unsigned long long CommonRunDevice::getFingerprint() {
+template <class Host> unsigned long long CommonRunDevice<Host>::getFingerprint() {
     settle();
-    return HostRunDevice::getFingerprint();
+    return Host::getFingerprint();
 }
 
-void CommonRunDevice::start() {
+template <class Host> void CommonRunDevice<Host>::start() {
     settle();
     isOnDevice = false;
     isOnHost = true;
     hasForces = false;
     correctMasses();
-    HostRunDevice::start();
+    Host::start();
     knownCount = vectors->getStepCount();
 }
 
-void CommonRunDevice::changeState() {
+template <class Host> void CommonRunDevice<Host>::changeState() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
         hasForces = false;
-        HostRunDevice::changeState();
+        Host::changeState();
         return;
     }
     computeForces();
@@ -337,12 +326,12 @@ void CommonRunDevice::changeState() {
     readState();
 }
 
-void CommonRunDevice::changeForces() {
+template <class Host> void CommonRunDevice<Host>::changeForces() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
         hasForces = false;
-        HostRunDevice::changeForces();
+        Host::changeForces();
         return;
     }
     computeForces();
@@ -351,11 +340,11 @@ void CommonRunDevice::changeForces() {
     readState();
 }
 
-void CommonRunDevice::changeVelocities() {
+template <class Host> void CommonRunDevice<Host>::changeVelocities() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
-        HostRunDevice::changeVelocities();
+        Host::changeVelocities();
         return;
     }
     ensureForces();
@@ -364,7 +353,7 @@ void CommonRunDevice::changeVelocities() {
 }
 
 // After a change; where it has failed, the host will say why.
-void CommonRunDevice::readState() {
+template <class Host> void CommonRunDevice<Host>::readState() {
     isOnHost = false;
     hasReport = hasBegun;
     if (!hasBegun)
@@ -373,81 +362,79 @@ void CommonRunDevice::readState() {
     state = lastReport.state;
 }
 
-void CommonRunDevice::writeVelocities() {
+template <class Host> void CommonRunDevice<Host>::writeVelocities() {
     settle();
     if (!isOnDevice)
-        HostRunDevice::writeVelocities();
+        Host::writeVelocities();
 }
 
-void CommonRunDevice::reverse() {
+template <class Host> void CommonRunDevice<Host>::reverse() {
     takeToHost();
-    HostRunDevice::reverse();
-}
-
-void CommonRunDevice::beginTrial(double stepSize, bool isBackwards) {
-    takeToHost();
-    HostVRattleDevice::beginTrial(stepSize, isBackwards);
+    Host::reverse();
 }
 
 // ------------------------------------------------------------------------------------------------------------- numbers
 
-RunDevice::LastStep CommonRunDevice::getLastStep() {
+template <class Host> RunDevice::LastStep CommonRunDevice<Host>::getLastStep() {
     settle();
     return lastStep;
 }
 
-double CommonRunDevice::getTime() {
+template <class Host> double CommonRunDevice<Host>::getTime() {
     settle();
-    return HostRunDevice::getTime();
+    return Host::getTime();
 }
 
-vector<double> CommonRunDevice::getMonitorValues() {
+template <class Host> bool CommonRunDevice<Host>::readMonitorValues(vector<double>& values) {
     settle();
-    if (isOnDevice && hasBegun) {
-        if (!hasReport) {
-            lastReport = steps->read();
-            hasReport = true;
-        }
-        return lastReport.values;
+    if (!isOnDevice || !hasBegun) {
+        bringToHost();
+        return false;
     }
-    bringToHost();
-    return HostVRattleDevice::getMonitorValues();
+    if (!hasReport)
+        lastReport = steps->read();
+    hasReport = true;
+    values = lastReport.values;
+    return true;
 }
 
-vector<double> CommonRunDevice::getMultipliers() {
+template <class Host> vector<double> CommonRunDevice<Host>::getMultipliers() {
     bringToHost();
-    return HostRunDevice::getMultipliers();
+    return Host::getMultipliers();
 }
 
-double CommonRunDevice::computeKineticEnergy() {
+template <class Host> double CommonRunDevice<Host>::computeKineticEnergy() {
     settle();
     ContextSelector selector(compute);
     return compute.getIntegrationUtilities().computeKineticEnergy(0);
 }
 
-long long CommonRunDevice::getNumSolverIterations() {
+template <class Host> long long CommonRunDevice<Host>::getNumSolverIterations() {
     settle();
-    return HostRunDevice::getNumSolverIterations() + (steps == nullptr ? 0 : steps->getNumIterations());
+    return Host::getNumSolverIterations() + (steps == nullptr ? 0 : steps->getNumIterations());
 }
 
-long long CommonRunDevice::getNumRescues() {
+template <class Host> long long CommonRunDevice<Host>::getNumDeviceRescues() {
     settle();
-    return HostVRattleDevice::getNumRescues() + numDeviceRescues;
+    return numDeviceRescues;
 }
 
-void CommonRunDevice::save(RunState& run) {
+template <class Host> void CommonRunDevice<Host>::save(RunState& run) {
     bringToHost();
-    HostRunDevice::save(run);
+    Host::save(run);
 }
 
-bool CommonRunDevice::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
+template <class Host>
+bool CommonRunDevice<Host>::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     settle();
     hasForces = false;
     correctMasses();
-    if (!HostRunDevice::resume(run, saved, areForcesOthers))
+    if (!Host::resume(run, saved, areForcesOthers))
         return false;
     isOnDevice = false;
     isOnHost = true;
     knownCount = vectors->getStepCount();
     return true;
 }
+
+template class OpenMMVRattle::CommonRunDevice<HostVRattleDevice>;

@@ -6,7 +6,8 @@
 
 #include "DeviceSteps.h"
 #include "openmm/internal/ContextImpl.h"
-#include "run/HostVRattleDevice.h"
+#include "run/RunDevice.h"
+#include "run/RunState.h"
 #include <memory>
 
 namespace OpenMMVRattle {
@@ -15,16 +16,18 @@ namespace OpenMMVRattle {
  * The device for OpenCL, CUDA and HIP. The steps in the middle of a run are taken by the GPU (DeviceSteps), which nobody waits for
  * until the run settles. What is rare is done on the host with forces from the GPU: the start, the first step, a step that the GPU
  * could not complete, trial runs, turning around, saving. The two hand the state over to each other. What the GPU cannot do is
- * done on the host throughout: automatic step control, and constraints for which there are no kernels.
+ * done on the host throughout, such as constraints for which there are no kernels.
+ *
+ * What is particular to a method is in the classes derived from this one. Host is the method's device on the host.
  */
-class CommonRunDevice : public HostVRattleDevice {
+template <class Host> class CommonRunDevice : public Host {
 public:
     CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
                     const IntegratorSettings& settings);
     void setSettings(const IntegratorSettings& settings) override;
     void setReferences(const std::vector<double>& references) override;
     bool updateState() override;
-    Change findChange() override;
+    RunDevice::Change findChange() override;
     unsigned long long getFingerprint() override;
     void start() override;
     void changeState() override;
@@ -34,24 +37,46 @@ public:
     void step(double maxTime) override;
     void settle() override;
     void reverse() override;
-    LastStep getLastStep() override;
+    RunDevice::LastStep getLastStep() override;
     double getTime() override;
-    void beginTrial(double stepSize, bool isBackwards) override;
-    std::vector<double> getMonitorValues() override;
     std::vector<double> getMultipliers() override;
     double computeKineticEnergy() override;
     bool usesForcesOfOthers() override {
         return true;
     }
     long long getNumSolverIterations() override;
-    long long getNumRescues() override;
     void save(RunState& run) override;
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
+    typedef typename Host::Vectors Vectors;
+    using Host::ahead;
+    using Host::boxVectors;
+    using Host::expressions;
+    using Host::forceGroups;
+    using Host::lastStep;
+    using Host::masses;
+    using Host::method;
+    using Host::reach;
+    using Host::vectors;
     double computeForces() override;
     double getPositionRounding() const override;
     bool differ(const Vectors& a, const Vectors& b) override;
+    /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
+    virtual bool canGoOnDevice() = 0;
+    /** The settings in force, for the GPU. */
+    virtual DeviceSteps::Settings makeDeviceSettings() = 0;
+    /** What there is of the host's state beside positions, velocities and forces. */
+    virtual DeviceSteps::State makeDeviceState() = 0;
+    /** Let the host go on with the state of the GPU. */
+    virtual void adopt(const typename Host::State& state, const DeviceSteps::State& others) = 0;
+    /** Whether it matters that all velocities have changed by the same. */
+    virtual bool doesFrameMatter() = 0;
+    /** The monitors on the GPU, if it is there that the state is. */
+    bool readMonitorValues(std::vector<double>& values);
+    void bringToHost();
+    void takeToHost();
+    long long getNumDeviceRescues();
 
 private:
     bool canStepOnDevice();
@@ -63,8 +88,6 @@ private:
     void beginOnDevice();
     void stepOnDevice(double maxTime);
     void accept(const DeviceSteps::Report& report);
-    void bringToHost();
-    void takeToHost();
     OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
     std::unique_ptr<DeviceSteps> steps; // none where the host takes them all

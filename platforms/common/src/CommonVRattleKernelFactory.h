@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_COMMONVRATTLEKERNELFACTORY_H_
 #define OPENMMVRATTLE_COMMONVRATTLEKERNELFACTORY_H_
 
-#include "CommonRunDevice.h"
+#include "CommonVRattleDevice.h"
 #include "ComputeVectors.h"
 #include "openmm/KernelFactory.h"
 #include "openmm/OpenMMException.h"
@@ -31,7 +31,7 @@ public:
                 makeHostRunDevice(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings);
         }
         else
-            device = std::make_unique<CommonRunDevice>(context, compute, integrator, settings);
+            device = std::make_unique<CommonVRattleDevice>(context, compute, integrator, settings);
         return *device;
     }
 

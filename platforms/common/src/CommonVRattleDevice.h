@@ -1,0 +1,31 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_COMMONVRATTLEDEVICE_H_
+#define OPENMMVRATTLE_COMMONVRATTLEDEVICE_H_
+
+#include "CommonRunDevice.h"
+#include "run/HostVRattleDevice.h"
+
+namespace OpenMMVRattle {
+
+/** The device of VariableStepRattleIntegrator for OpenCL, CUDA and HIP. With automatic step control the host takes all steps. */
+class CommonVRattleDevice : public CommonRunDevice<HostVRattleDevice> {
+public:
+    CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
+                        const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    void beginTrial(double stepSize, bool isBackwards) override;
+    std::vector<double> getMonitorValues() override;
+    long long getNumRescues() override;
+
+protected:
+    bool canGoOnDevice() override;
+    DeviceSteps::Settings makeDeviceSettings() override;
+    DeviceSteps::State makeDeviceState() override;
+    void adopt(const State& state, const DeviceSteps::State& others) override;
+    bool doesFrameMatter() override;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_COMMONVRATTLEDEVICE_H_
