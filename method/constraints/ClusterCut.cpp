@@ -3,6 +3,7 @@
 
 #include "constraints/ClusterCut.h"
 #include <algorithm>
+#include <numeric>
 
 using std::vector;
 
@@ -88,6 +89,16 @@ ClusterCut collect(const vector<int>& particles, const vector<vector<int>>& part
 }
 
 } // namespace
+
+ClusterCut leaveWhole(const vector<vector<int>>& given) {
+    vector<vector<int>> particlesOf = given;
+    ClusterCut result;
+    result.pieces.resize(1);
+    result.pieces[0].particles = numberParticles(particlesOf);
+    result.pieces[0].constraints.resize(given.size());
+    std::iota(result.pieces[0].constraints.begin(), result.pieces[0].constraints.end(), 0);
+    return result;
+}
 
 ClusterCut cutCluster(const vector<vector<int>>& given, int pieceSize) {
     const int numPieces = (int) given.size() / pieceSize;

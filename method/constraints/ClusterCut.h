@@ -21,6 +21,9 @@ struct ClusterCut {
     std::vector<int> joints;
 };
 
+/** A cluster as one piece. */
+ClusterCut leaveWhole(const std::vector<std::vector<int>>& particlesOf);
+
 /**
  * Cut a cluster across its length. One that has none, as a sheet or a network, would get many joints, and is left whole.
  *

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "constraints/ClusterLayout.h"
-#include "constraints/EliminationOrder.h"
 #include <algorithm>
 #include <map>
 #include <numeric>
@@ -40,16 +39,15 @@ public:
             inverseMasses(inverseMasses), given(given) {
     }
     vector<vector<int>> findClusters(const vector<int>& members) const;
-    ClusterLayout::GeneralCluster cutAndOrder(const vector<int>& cluster) const;
+    ClusterElimination cutAndOrder(const vector<int>& cluster) const;
 
 private:
     vector<int> findMovingParticles(int k) const;
-    bool orderForElimination(vector<int>& members) const;
+    vector<int> orderAlongMolecule(const vector<int>& cluster, const vector<int>& members) const;
     vector<int> walk(const vector<int>& cluster) const;
     vector<int> walkThroughParticles(const vector<int>& cluster, const std::map<int, vector<int>>& constraintsOf) const;
     vector<int> walkThroughConstraints(const vector<int>& cluster,
                                        const std::map<int, vector<int>>& constraintsOf) const;
-    void orderJoints(ClusterLayout::GeneralCluster& cluster) const;
     const vector<double>& inverseMasses; // 0 for a particle that does not move
     const Given& given;
 };
@@ -109,91 +107,37 @@ vector<vector<int>> LayoutBuilder::findClusters(const vector<int>& members) cons
 }
 
 // Cut a cluster that is large, and put its constraints in the order in which they are eliminated.
-ClusterLayout::GeneralCluster LayoutBuilder::cutAndOrder(const vector<int>& cluster) const {
+ClusterElimination LayoutBuilder::cutAndOrder(const vector<int>& cluster) const {
     vector<vector<int>> particlesOf;
     for (int k : cluster)
         particlesOf.push_back(findMovingParticles(k));
     ClusterCut cut;
     if ((int) cluster.size() >= MIN_CUT_SIZE)
         cut = cutCluster(particlesOf, ClusterLayout::PIECE_SIZE);
-    if (cut.pieces.empty()) {
-        ClusterCut::Piece whole;
-        whole.constraints = cluster;
-        for (const vector<int>& particles : particlesOf)
-            whole.particles.insert(whole.particles.end(), particles.begin(), particles.end());
-        std::sort(whole.particles.begin(), whole.particles.end());
-        whole.particles.erase(std::unique(whole.particles.begin(), whole.particles.end()), whole.particles.end());
-        const bool hasWideColumns = orderForElimination(whole.constraints);
-        return {{whole}, {}, hasWideColumns};
-    }
-    ClusterLayout::GeneralCluster result = {std::move(cut.pieces), std::move(cut.joints), true};
-    for (int& k : result.joints)
-        k = cluster[k];
-    for (ClusterCut::Piece& piece : result.pieces) {
-        for (int& k : piece.constraints)
+    if (cut.pieces.empty())
+        cut = leaveWhole(particlesOf);
+    for (ClusterCut::Piece& piece : cut.pieces)
+        piece.constraints = orderAlongMolecule(cluster, piece.constraints);
+    ClusterElimination result(particlesOf, cut, ClusterElimination::LeastFill);
+    auto toGiven = [&](vector<int>& members) {
+        for (int& k : members)
             k = cluster[k];
-        orderForElimination(piece.constraints);
-    }
-    orderJoints(result);
+    };
+    for (ClusterElimination::Piece& piece : result.pieces)
+        toGiven(piece.constraints);
+    toGiven(result.joints);
     return result;
 }
 
-// When the pieces have been eliminated, the joints at the ends of each are coupled.
-void LayoutBuilder::orderJoints(ClusterLayout::GeneralCluster& cluster) const {
-    std::map<int, int> pieceOf; // of the particles at joints
-    for (int k : cluster.joints)
-        for (int i : findMovingParticles(k))
-            pieceOf[i] = -1;
-    for (size_t p = 0; p < cluster.pieces.size(); p++)
-        for (int i : cluster.pieces[p].particles) {
-            const auto found = pieceOf.find(i);
-            if (found != pieceOf.end())
-                found->second = (int) p;
-        }
-    vector<std::set<int>> jointsOf(cluster.pieces.size());
-    for (size_t place = 0; place < cluster.joints.size(); place++)
-        for (int i : findMovingParticles(cluster.joints[place]))
-            jointsOf[pieceOf[i]].insert((int) place);
-    std::set<std::pair<int, int>> entries;
-    for (const std::set<int>& joints : jointsOf)
-        for (int a : joints)
-            for (int b : joints)
-                if (a > b)
-                    entries.emplace(a, b);
-    const EliminationOrder order = findEliminationOrder((int) cluster.joints.size(), {entries.begin(), entries.end()});
-    vector<int> ordered;
-    for (int place : order.rows)
-        ordered.push_back(cluster.joints[place]);
-    cluster.joints.swap(ordered);
-}
-
-/*
- * Order constraints so that eliminating them one after the other fills in little, and neighbours in memory are neighbours in the
- * molecule. Two constraints are coupled if they share a moving particle. Returns whether there are wide columns.
- */
-bool LayoutBuilder::orderForElimination(vector<int>& members) const {
-    vector<int> order;
-    for (const vector<int>& joined : findClusters(members)) {
-        const vector<int> walked = walk(joined);
-        order.insert(order.end(), walked.begin(), walked.end());
-    }
-    vector<std::pair<int, int>> ends; // particles, and the places of their constraints
-    for (size_t place = 0; place < order.size(); place++)
-        for (int i : findMovingParticles(order[place]))
-            ends.emplace_back(i, (int) place);
-    std::sort(ends.begin(), ends.end());
-    MatrixEntries entries;
-    for (size_t a = 0; a < ends.size(); a++)
-        for (size_t b = a; b > 0 && ends[b - 1].first == ends[a].first; b--)
-            if (ends[b - 1].second < ends[a].second)
-                entries.emplace_back(ends[a].second, ends[b - 1].second);
-    std::sort(entries.begin(), entries.end());
-    entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
-    const EliminationOrder best = findEliminationOrder((int) order.size(), entries);
-    members.clear();
-    for (int place : best.rows)
-        members.push_back(order[place]);
-    return best.numNarrow < (int) order.size();
+// So that neighbours in memory are neighbours in the molecule. Members are places in the cluster, whose constraints are sorted.
+vector<int> LayoutBuilder::orderAlongMolecule(const vector<int>& cluster, const vector<int>& members) const {
+    vector<int> given, order;
+    for (int place : members)
+        given.push_back(cluster[place]);
+    for (const vector<int>& joined : findClusters(given))
+        for (int k : walk(joined))
+            order.push_back((int) (std::lower_bound(cluster.begin(), cluster.end(), k) - cluster.begin()));
+    return order;
 }
 
 // The constraints of a cluster, or of a connected part of it, in an order in which neighbours are coupled.
@@ -344,13 +288,13 @@ ClusterLayout::ClusterLayout(const vector<double>& inverseMasses, const vector<D
         batches.push_back(std::move(batch));
     }
     auto isDistance = [&](int k) { return !given.isExpression(k); };
-    auto hasNoExpression = [&](const GeneralCluster& cluster) {
+    auto hasNoExpression = [&](const ClusterElimination& cluster) {
         return std::all_of(cluster.joints.begin(), cluster.joints.end(), isDistance) &&
-               std::all_of(cluster.pieces.begin(), cluster.pieces.end(), [&](const ClusterCut::Piece& piece) {
+               std::all_of(cluster.pieces.begin(), cluster.pieces.end(), [&](const ClusterElimination::Piece& piece) {
                    return std::all_of(piece.constraints.begin(), piece.constraints.end(), isDistance);
                });
     };
     std::stable_partition(general.begin(), general.end(), hasNoExpression);
     std::stable_partition(general.begin(), general.end(),
-                          [](const GeneralCluster& cluster) { return cluster.pieces.size() == 1; });
+                          [](const ClusterElimination& cluster) { return cluster.pieces.size() == 1; });
 }

@@ -5,7 +5,7 @@
 #define OPENMMVRATTLE_CLUSTERLAYOUT_H_
 
 #include "constraints/ClusterBatch.h"
-#include "constraints/ClusterCut.h"
+#include "constraints/ClusterElimination.h"
 #include "expressions/ExpressionGroup.h"
 #include <vector>
 
@@ -26,12 +26,6 @@ struct ClusterLayout {
         std::vector<ClusterShape> shapes;
         std::vector<int> constraints, particles; // cluster after cluster, in the order of ClusterBatch::arrange()
     };
-    /** Another cluster: the constraints of the whole, or those of each piece if it is cut, and the joints between these. */
-    struct GeneralCluster {
-        std::vector<ClusterCut::Piece> pieces;
-        std::vector<int> joints;
-        bool hasWideColumns; // of its factor
-    };
 
     /**
      * @param inverseMasses    1/mass of each particle, 0 for one that does not move; a distance constraint between two of
@@ -40,7 +34,8 @@ struct ClusterLayout {
     ClusterLayout(const std::vector<double>& inverseMasses, const std::vector<DistanceConstraint>& distances,
                   const std::vector<ExpressionConstraint>& expressions);
     std::vector<Batch> batches;
-    std::vector<GeneralCluster> general; // first those that are not cut, of these the ones with an expression last
+    std::vector<ClusterElimination>
+        general; // the others: first those that are not cut, of these the ones with an expression last
 };
 
 } // namespace OpenMMVRattle

@@ -52,9 +52,9 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
         batches.push_back(ClusterBatch::create(batch.numBonds, batch.isTriangle, batch.shapes, batch.particles, first));
     }
     firstGeneral = (int) constraints.size();
-    for (const ClusterLayout::GeneralCluster& cluster : layout.general) {
+    for (const ClusterElimination& cluster : layout.general) {
         const int first = getNumConstraints();
-        for (const ClusterCut::Piece& piece : cluster.pieces)
+        for (const ClusterElimination::Piece& piece : cluster.pieces)
             append(piece.constraints);
         append(cluster.joints);
         clusters.push_back({first, getNumConstraints() - first});
@@ -144,7 +144,7 @@ void ConstraintSystem::findParts(const ClusterLayout& layout) {
         beginNext();
     };
     closePart(); // the batches
-    for (const ClusterLayout::GeneralCluster& cluster : layout.general) {
+    for (const ClusterElimination& cluster : layout.general) {
         if (cluster.pieces.size() == 1) {
             if (cluster.hasWideColumns)
                 closePart();
@@ -156,7 +156,7 @@ void ConstraintSystem::findParts(const ClusterLayout& layout) {
         closePart();
         CutCluster cut;
         cut.firstPiece = (int) pieces.size();
-        for (const ClusterCut::Piece& piece : cluster.pieces) {
+        for (const ClusterElimination::Piece& piece : cluster.pieces) {
             extend(piece.constraints, piece.particles);
             pieces.push_back(open);
             pieces.back().piece = (int) pieces.size() - 1;

@@ -3,6 +3,7 @@
 
 #include "LargeClusters.h"
 #include "constraints/ClusterCut.h"
+#include "constraints/ClusterElimination.h"
 #include "constraints/EliminationOrder.h"
 #include <algorithm>
 #include <cstdint>
@@ -104,27 +105,19 @@ private:
 
 } // namespace
 
-// The elimination of the rows of a sparse matrix, outer rows excepted.
+// The factor of a sparse matrix whose rows are in the order of elimination, outer rows excepted, which are behind.
 struct LargeClusters::Elimination {
     int size, numOuter, numLevels;
-    vector<int> order, places;    // row of each place, and back; outer rows are behind
     vector<int> levels;           // the first place of each level
     vector<vector<int>> columns;  // the places below the diagonal of each column of L, sorted
     vector<int> columnStart;      // entries before each column
     vector<pair<int, int>> outer; // entries between outer rows, by places
     map<pair<int, int>, int> outerSlots;
 
-    Elimination(int size, int numOuter, const MatrixEntries& entries) : size(size), numOuter(numOuter) {
-        const EliminationOrder found = findEliminationRounds(size, entries, numOuter);
-        order = found.rows;
-        numLevels = found.numLevels;
-        for (int row = size; row < size + numOuter; row++)
-            order.push_back(row);
-        places.resize(order.size());
-        for (size_t place = 0; place < order.size(); place++)
-            places[order[place]] = (int) place;
+    Elimination(const vector<int>& levelOfRow, int numLevels, int numOuter, const MatrixEntries& entries) :
+            size((int) levelOfRow.size()), numOuter(numOuter), numLevels(numLevels) {
         for (int place = 0; place < size; place++)
-            for (; (int) levels.size() <= found.levels[place];)
+            while ((int) levels.size() <= levelOfRow[place])
                 levels.push_back(place);
         levels.push_back(size);
         findColumns(entries);
@@ -132,14 +125,11 @@ struct LargeClusters::Elimination {
     void findColumns(const MatrixEntries& entries) {
         columns.resize(size);
         std::set<pair<int, int>> between;
-        auto add = [&](int a, int b) {
-            if (std::min(a, b) < size)
-                columns[std::min(a, b)].push_back(std::max(a, b));
-            else
-                between.insert({std::max(a, b), std::min(a, b)});
-        };
         for (const auto& entry : entries)
-            add(places[entry.first], places[entry.second]);
+            if (entry.second < size)
+                columns[entry.second].push_back(entry.first);
+            else
+                between.insert(entry);
         columnStart.push_back(0);
         for (int place = 0; place < size; place++) {
             vector<int>& column = columns[place];
@@ -341,80 +331,66 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
     vector<vector<int>> particlesOf;
     for (const auto& pair : kind.pairs)
         particlesOf.push_back({pair.first, pair.second});
-    ClusterCut cut;
-    const size_t size = pieceSize;
-    if (pieceSize > 0 && count > WHOLE * size)
-        cut = cutClusterAlongTree(particlesOf, pieceSize);
-    if (cut.pieces.size() < 2) {
-        cut = ClusterCut();
-        cut.pieces.resize(1);
-        for (int i = 0; i < kind.numAtoms; i++)
-            cut.pieces[0].particles.push_back(i);
-        for (int k = 0; k < count; k++)
-            cut.pieces[0].constraints.push_back(k);
-    }
-    const int numPieceJoints = (int) cut.joints.size();
+    const bool isCut = pieceSize > 0 && count > WHOLE * pieceSize;
+    const ClusterElimination cluster(particlesOf,
+                                     isCut ? cutClusterAlongTree(particlesOf, pieceSize) : leaveWhole(particlesOf),
+                                     ClusterElimination::FewLevels);
+    const int numPieceJoints = (int) cluster.joints.size();
     if (numPieceJoints > MANY_JOINTS)
         return false;
     vector<int> pieceOf(kind.numAtoms), placeOf(kind.numAtoms);
-    for (size_t p = 0; p < cut.pieces.size(); p++)
-        for (size_t i = 0; i < cut.pieces[p].particles.size(); i++) {
-            pieceOf[cut.pieces[p].particles[i]] = (int) p;
-            placeOf[cut.pieces[p].particles[i]] = (int) i;
+    for (size_t p = 0; p < cluster.pieces.size(); p++)
+        for (size_t i = 0; i < cluster.pieces[p].particles.size(); i++) {
+            pieceOf[cluster.pieces[p].particles[i]] = (int) p;
+            placeOf[cluster.pieces[p].particles[i]] = (int) i;
         }
 
     // Each piece alone; its joints are its outer rows.
     struct Part {
-        vector<int> borders; // numbers of joints
-        vector<vector<int>> constraintsOf; // of each particle, by numbers of rows before the elimination
+        vector<int> constraints; // of each row: inner ones, then borders
+        vector<vector<int>> rowsOf; // of each particle
         std::unique_ptr<Elimination> elimination;
         map<pair<int, int>, vector<int>>
             couplings; // between rows: the particle's place, twice, + 1 where the signs differ
     };
-    vector<Part> parts(cut.pieces.size());
-    for (int j = 0; j < numPieceJoints; j++)
-        for (int i : particlesOf[cut.joints[j]])
-            parts[pieceOf[i]].borders.push_back(j);
+    vector<Part> parts(cluster.pieces.size());
     MatrixEntries jointEntries;
     for (size_t p = 0; p < parts.size(); p++) {
         Part& part = parts[p];
-        vector<int>& inner = cut.pieces[p].constraints;
-        const int numInner = (int) inner.size(), numBorders = (int) part.borders.size();
-        part.constraintsOf.resize(cut.pieces[p].particles.size());
-        auto constraintOf = [&](int row) {
-            return row < numInner ? inner[row] : cut.joints[part.borders[row - numInner]];
-        };
-        for (int row = 0; row < numInner + numBorders; row++)
-            for (int i : particlesOf[constraintOf(row)])
+        const ClusterElimination::Piece& piece = cluster.pieces[p];
+        part.constraints = piece.constraints;
+        for (int joint : piece.borders)
+            part.constraints.push_back(cluster.joints[joint]);
+        part.rowsOf.resize(piece.particles.size());
+        for (size_t row = 0; row < part.constraints.size(); row++)
+            for (int i : particlesOf[part.constraints[row]])
                 if (pieceOf[i] == (int) p)
-                    part.constraintsOf[placeOf[i]].push_back(row);
+                    part.rowsOf[placeOf[i]].push_back((int) row);
         MatrixEntries entries;
-        for (size_t i = 0; i < part.constraintsOf.size(); i++)
-            for (int a : part.constraintsOf[i])
-                for (int b : part.constraintsOf[i])
+        for (size_t i = 0; i < part.rowsOf.size(); i++)
+            for (int a : part.rowsOf[i])
+                for (int b : part.rowsOf[i])
                     if (a > b) {
-                        const int particle = cut.pieces[p].particles[i];
-                        const bool differs = (particlesOf[constraintOf(a)][0] == particle) !=
-                                             (particlesOf[constraintOf(b)][0] == particle);
+                        const int particle = piece.particles[i];
+                        const bool differs = (particlesOf[part.constraints[a]][0] == particle) !=
+                                             (particlesOf[part.constraints[b]][0] == particle);
                         entries.emplace_back(a, b);
                         part.couplings[{a, b}].push_back(2 * (int) i + differs);
                     }
-        part.elimination.reset(new Elimination(numInner, numBorders, entries));
+        part.elimination.reset(new Elimination(piece.levels, piece.numLevels, (int) piece.borders.size(), entries));
         const Elimination& elimination = *part.elimination;
         if (form.areRecords && (!elimination.isNarrow() ||
                                 elimination.getFirstOuterSlot() + (int) elimination.outer.size() > LARGEST_INDEX - 8))
             return false;
         for (const auto& entry : elimination.outer)
-            jointEntries.emplace_back(part.borders[elimination.order[entry.first] - numInner],
-                                      part.borders[elimination.order[entry.second] - numInner]);
+            jointEntries.emplace_back(piece.borders[entry.first - elimination.size],
+                                      piece.borders[entry.second - elimination.size]);
     }
-    for (auto& entry : jointEntries)
-        entry = {std::max(entry.first, entry.second), std::min(entry.first, entry.second)};
     std::sort(jointEntries.begin(), jointEntries.end());
     jointEntries.erase(std::unique(jointEntries.begin(), jointEntries.end()), jointEntries.end());
     std::unique_ptr<Elimination> joined;
     if (numPieceJoints > 0)
-        joined.reset(new Elimination(numPieceJoints, 0, jointEntries));
+        joined.reset(new Elimination(cluster.jointLevels, cluster.numJointLevels, 0, jointEntries));
     const int numJointEntries = joined == nullptr ? 0 : joined->getNumEntries();
     if (joined != nullptr && (!joined->isNarrow() || numPieceJoints + numJointEntries > LARGEST_INDEX))
         return false;
@@ -424,16 +400,14 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
     vector<Layout> layouts(parts.size());
     int numContributions = 0;
     for (size_t p = 0; p < parts.size(); p++) {
-        const Part& part = parts[p];
-        const int numInner = part.elimination->size;
+        const vector<int>& borders = cluster.pieces[p].borders;
+        const int numInner = parts[p].elimination->size;
         layouts[p].firstContribution = numContributions;
-        for (int joint : part.borders)
-            sources[joined->places[joint]].push_back(numContributions++);
-        for (const auto& entry : part.elimination->outer) {
-            const int a = joined->places[part.borders[part.elimination->order[entry.first] - numInner]];
-            const int b = joined->places[part.borders[part.elimination->order[entry.second] - numInner]];
-            sources[joined->findSlot(std::max(a, b), std::min(a, b))].push_back(numContributions++);
-        }
+        for (int joint : borders)
+            sources[joint].push_back(numContributions++);
+        for (const auto& entry : parts[p].elimination->outer)
+            sources[joined->findSlot(borders[entry.first - numInner], borders[entry.second - numInner])].push_back(
+                numContributions++);
     }
     if (numContributions > LARGEST_INDEX)
         return false;
@@ -444,12 +418,10 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         const Elimination& elimination = *part.elimination;
         Layout& layout = layouts[p];
         const int numInner = elimination.size, numRows = elimination.getNumRows();
-        const int numBorders = elimination.numOuter, numParticles = (int) cut.pieces[p].particles.size();
+        const int numBorders = elimination.numOuter, numParticles = (int) cluster.pieces[p].particles.size();
         layout.numInner = numInner;
-        layout.particles = cut.pieces[p].particles;
-        for (int row : elimination.order)
-            layout.constraints.push_back(row < numInner ? cut.pieces[p].constraints[row]
-                                                        : cut.joints[part.borders[row - numInner]]);
+        layout.particles = cluster.pieces[p].particles;
+        layout.constraints = part.constraints;
         Writer writer(form.areRecords);
         writer.set(NumLevels, elimination.numLevels);
         if (form.areRecords) {
@@ -469,9 +441,9 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
                 writer.set(JointLevelStarts, writer.addWords(jointStarts));
                 writer.set(JointMore, writer.addIndices(jointMore));
                 vector<int> borders, sourceStart(1, 0), sourceList;
-                for (int joint : part.borders) {
-                    const int side = pieceOf[particlesOf[cut.joints[joint]][0]] == (int) p ? 0 : 1;
-                    borders.push_back(2 * joined->places[joint] + side);
+                for (int joint : cluster.pieces[p].borders) {
+                    const int side = pieceOf[particlesOf[cluster.joints[joint]][0]] == (int) p ? 0 : 1;
+                    borders.push_back(2 * joint + side);
                 }
                 for (const vector<int>& list : sources) {
                     sourceList.insert(sourceList.end(), list.begin(), list.end());
@@ -511,10 +483,9 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         }
         vector<int> couplings;
         for (const auto& coupling : part.couplings) {
-            const int a = elimination.places[coupling.first.first], b = elimination.places[coupling.first.second];
-            couplings.insert(couplings.end(),
-                             {elimination.findSlot(std::max(a, b), std::min(a, b)), a, b, coupling.second[0],
-                              coupling.second.size() > 1 ? coupling.second[1] : -1});
+            const int a = coupling.first.first, b = coupling.first.second;
+            couplings.insert(couplings.end(), {elimination.findSlot(a, b), a, b, coupling.second[0],
+                                               coupling.second.size() > 1 ? coupling.second[1] : -1});
         }
         writer.set(NumCouplings, (int) part.couplings.size());
         writer.set(Couplings, writer.addWords(couplings));
@@ -525,10 +496,8 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         writer.set(Ends, writer.addWords(ends));
         vector<int> incidenceStart(1, 0), incidence;
         for (int i = 0; i < numParticles; i++) {
-            for (int row : part.constraintsOf[i]) {
-                const int place = elimination.places[row];
-                incidence.push_back(2 * place + (particlesOf[layout.constraints[place]][0] != layout.particles[i]));
-            }
+            for (int row : part.rowsOf[i])
+                incidence.push_back(2 * row + (particlesOf[layout.constraints[row]][0] != layout.particles[i]));
             incidenceStart.push_back((int) incidence.size());
         }
         writer.set(IncidenceStart, writer.addIndices(incidenceStart));
@@ -560,7 +529,7 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         const int firstJoint = (int) joints.size(), channel = (int) numWords;
         numWords += (size_t) (limits.mixedSize / 4) * (16 * numPieceJoints + numContributions);
         for (int place = 0; place < numPieceJoints; place++) {
-            const int k = cut.joints[joined->order[place]];
+            const int k = cluster.joints[place];
             joints.push_back(
                 {kind.atoms[c][kind.pairs[k].first], kind.atoms[c][kind.pairs[k].second], numConstraints + k, 0});
             jointLengths.push_back(kind.lengths[c][k]);
