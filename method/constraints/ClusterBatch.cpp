@@ -68,23 +68,20 @@ public:
     static constexpr int B = Topology::numBonds;
     static constexpr int P = Topology::numParticles;
 
-    BatchOf(const vector<ClusterShape>& clusters, const vector<int>& particleTable, int firstConstraint) :
-            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) clusters.size()) {
+    BatchOf(const vector<ClusterShape>& given, const vector<int>& shapeOf, const vector<int>& particleTable,
+            int firstConstraint) :
+            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) shapeOf.size()) {
         // Few packs differ in most systems: then their shapes stay in the processor's cache.
-        std::map<ClusterShape, int> numberOf;
-        vector<int> number;
-        for (const ClusterShape& cluster : clusters)
-            number.push_back(numberOf.emplace(cluster, (int) numberOf.size()).first->second);
         std::map<vector<int>, int> placeOf;
         for (int first = 0; first < numClusters; first += PACK_SIZE) {
             vector<int> pack;
             for (int lane = 0; lane < PACK_SIZE; lane++)
-                pack.push_back(number[std::min(first + lane, numClusters - 1)]);
+                pack.push_back(shapeOf[std::min(first + lane, numClusters - 1)]);
             const auto found = placeOf.emplace(pack, (int) shapes.size());
             if (found.second) {
                 shapes.emplace_back();
                 for (int lane = 0; lane < PACK_SIZE; lane++)
-                    fill(shapes.back(), lane, clusters[std::min(first + lane, numClusters - 1)]);
+                    fill(shapes.back(), lane, given[pack[lane]]);
             }
             shapeOfPack.push_back(found.first->second);
         }
@@ -493,19 +490,20 @@ void ClusterBatch::arrange(const vector<DistanceConstraint>& cluster, vector<int
     }
 }
 
-std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<ClusterShape>& clusters,
-                                                   const vector<int>& particles, int firstConstraint) {
+std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<ClusterShape>& shapes,
+                                                   const vector<int>& shapeOf, const vector<int>& particles,
+                                                   int firstConstraint) {
     typedef std::unique_ptr<ClusterBatch> Result;
     if (isTriangle)
-        return Result(new BatchOf<Triangle>(clusters, particles, firstConstraint));
+        return Result(new BatchOf<Triangle>(shapes, shapeOf, particles, firstConstraint));
     switch (numBonds) {
     case 1:
-        return Result(new BatchOf<Star<1>>(clusters, particles, firstConstraint));
+        return Result(new BatchOf<Star<1>>(shapes, shapeOf, particles, firstConstraint));
     case 2:
-        return Result(new BatchOf<Star<2>>(clusters, particles, firstConstraint));
+        return Result(new BatchOf<Star<2>>(shapes, shapeOf, particles, firstConstraint));
     case 3:
-        return Result(new BatchOf<Star<3>>(clusters, particles, firstConstraint));
+        return Result(new BatchOf<Star<3>>(shapes, shapeOf, particles, firstConstraint));
     default:
-        return Result(new BatchOf<Star<4>>(clusters, particles, firstConstraint));
+        return Result(new BatchOf<Star<4>>(shapes, shapeOf, particles, firstConstraint));
     }
 }

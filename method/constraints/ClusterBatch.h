@@ -110,13 +110,14 @@ public:
      *
      * @param numBonds           the number of constraints in a cluster
      * @param isTriangle         whether the three particles of a cluster are all joined
-     * @param clusters           masses and lengths of each cluster
+     * @param shapes             masses and lengths that occur
+     * @param shapeOf            the shape of each cluster
      * @param particles          the particles, cluster after cluster
      * @param firstConstraint    the first constraint of the batch in the internal order; the others follow, cluster after cluster
      */
-    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle,
-                                                const std::vector<ClusterShape>& clusters,
-                                                const std::vector<int>& particles, int firstConstraint);
+    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle, const std::vector<ClusterShape>& shapes,
+                                                const std::vector<int>& shapeOf, const std::vector<int>& particles,
+                                                int firstConstraint);
 };
 
 } // namespace OpenMMVRattle

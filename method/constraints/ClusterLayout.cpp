@@ -6,6 +6,8 @@
 #include <map>
 #include <numeric>
 #include <set>
+#include <stdexcept>
+#include <string>
 #include <utility>
 
 using namespace OpenMMVRattle;
@@ -240,6 +242,10 @@ vector<int> LayoutBuilder::walkThroughConstraints(const vector<int>& cluster,
 
 ClusterLayout::ClusterLayout(const vector<double>& inverseMasses, const vector<DistanceConstraint>& distances,
                              const vector<ExpressionConstraint>& expressions) {
+    for (const DistanceConstraint& c : distances)
+        if ((inverseMasses[c.particle1] == 0) != (inverseMasses[c.particle2] == 0))
+            throw std::invalid_argument("a distance constraint involves a particle whose mass is zero, " +
+                                        std::to_string(inverseMasses[c.particle1] == 0 ? c.particle1 : c.particle2));
     const Given given = {distances, expressions};
     const LayoutBuilder builder(inverseMasses, given);
     // Small clusters with the same topology make a batch; the others are general.
@@ -280,10 +286,14 @@ ClusterLayout::ClusterLayout(const vector<double>& inverseMasses, const vector<D
         Batch batch;
         batch.numBonds = entry.first.first;
         batch.isTriangle = batch.numBonds == 3 && entry.first.second == 3;
+        std::map<ClusterShape, int> numberOf;
         for (const Member& member : members) {
             batch.constraints.insert(batch.constraints.end(), member.constraints.begin(), member.constraints.end());
             batch.particles.insert(batch.particles.end(), member.particles.begin(), member.particles.end());
-            batch.shapes.push_back(member.shape);
+            const auto number = numberOf.emplace(member.shape, (int) batch.shapes.size());
+            if (number.second)
+                batch.shapes.push_back(member.shape);
+            batch.shapeOf.push_back(number.first->second);
         }
         batches.push_back(std::move(batch));
     }

@@ -13,8 +13,8 @@ namespace OpenMMVRattle {
 
 /**
  * How the constraints of a System fall into clusters, which are joined by shared particles that move, and in which order each cluster
- * is eliminated. It is a value, made once from masses and topology, and plain data to whoever reads it; constraints are counted as they
- * are given, distances first and then expressions.
+ * is eliminated. It is a value, made once for a System from masses and topology, and plain data to whoever reads it, on a processor
+ * or for a GPU; constraints are counted as they are given, distances first and then expressions.
  */
 struct ClusterLayout {
     /** The number of constraints that a piece of a large cluster has. */
@@ -23,7 +23,8 @@ struct ClusterLayout {
     struct Batch {
         int numBonds;
         bool isTriangle;
-        std::vector<ClusterShape> shapes;
+        std::vector<ClusterShape> shapes; // that occur
+        std::vector<int> shapeOf;         // of each cluster
         std::vector<int> constraints, particles; // cluster after cluster, in the order of ClusterBatch::arrange()
     };
 

@@ -8,7 +8,6 @@
 #include "constraints/ConstraintSystem.h"
 #include <algorithm>
 #include <map>
-#include <stdexcept>
 #include <tuple>
 
 using namespace OpenMMVRattle;
@@ -22,19 +21,20 @@ const int BLOCK_SIZE = 1024;
 // The number of constraints that a part of the general clusters is filled up to.
 const int PART_SIZE = ClusterLayout::PIECE_SIZE;
 
+vector<double> invert(const vector<double>& masses) {
+    vector<double> result;
+    for (double mass : masses)
+        result.push_back(mass > 0 ? 1.0 / mass : 0.0);
+    return result;
+}
+
 } // namespace
 
 ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<DistanceConstraint>& distances,
                                    const vector<ExpressionConstraint>& expressions) :
         numGivenConstraints((int) (distances.size() + expressions.size())), numGivenDistances((int) distances.size()),
-        masses(masses), inverseMasses(masses.size()), expressions(expressions) {
-    for (size_t i = 0; i < masses.size(); i++)
-        inverseMasses[i] = masses[i] > 0 ? 1.0 / masses[i] : 0.0;
-    for (const DistanceConstraint& c : distances)
-        if ((inverseMasses[c.particle1] == 0) != (inverseMasses[c.particle2] == 0))
-            throw std::invalid_argument("a distance constraint involves a particle whose mass is zero, " +
-                                        std::to_string(inverseMasses[c.particle1] == 0 ? c.particle1 : c.particle2));
-    const ClusterLayout layout(inverseMasses, distances, expressions);
+        masses(masses), inverseMasses(invert(masses)), layout(inverseMasses, distances, expressions),
+        expressions(expressions) {
     auto append = [&](const vector<int>& members) {
         for (int k : members) {
             constraints.push_back(k >= numGivenDistances ? DistanceConstraint{-1, -1, 1.0} : distances[k]);
@@ -49,7 +49,8 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
             clusters.push_back({k, batch.numBonds});
         for (int i : batch.particles)
             isInBatch[i] = true;
-        batches.push_back(ClusterBatch::create(batch.numBonds, batch.isTriangle, batch.shapes, batch.particles, first));
+        batches.push_back(ClusterBatch::create(batch.numBonds, batch.isTriangle, batch.shapes, batch.shapeOf,
+                                               batch.particles, first));
     }
     firstGeneral = (int) constraints.size();
     for (const ClusterElimination& cluster : layout.general) {
@@ -61,7 +62,7 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
     }
     groupExpressions();
     findStretches();
-    findParts(layout);
+    findParts();
     findGroupRanges();
     findJointEnds();
     findCouplings();
@@ -122,7 +123,7 @@ void ConstraintSystem::findStretches() {
 }
 
 // The general clusters in parts, with their particles.
-void ConstraintSystem::findParts(const ClusterLayout& layout) {
+void ConstraintSystem::findParts() {
     Part open = {0, firstGeneral, 0, 0, 0, 0, 0, 0, 0, 0, NONE, 0};
     auto beginNext = [&]() {
         open.index++;

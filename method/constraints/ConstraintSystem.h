@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
+#include "constraints/ClusterLayout.h"
 #include "constraints/DistanceConstraint.h"
 #include "expressions/ExpressionGroup.h"
 #include "openmm/Vec3.h"
@@ -14,9 +15,6 @@
 #include <vector>
 
 namespace OpenMMVRattle {
-
-class ClusterBatch;
-struct ClusterLayout;
 
 /**
  * The constraints g(q) = 0 of a system of particles, their Jacobian G = dg/dq, and the products with it that the method needs.
@@ -176,6 +174,10 @@ public:
                              const std::vector<double>& target, std::vector<double>& change) const;
     /** A constraint in words, for messages. */
     std::string describe(int index) const;
+    /** How the constraints fall into clusters, and how these are eliminated. */
+    const ClusterLayout& getLayout() const {
+        return layout;
+    }
     const std::vector<Cluster>& getClusters() const {
         return clusters;
     }
@@ -316,7 +318,7 @@ private:
     void groupExpressions();
     void findStretches();
     void findCouplings();
-    void findParts(const ClusterLayout& layout);
+    void findParts();
     void findGroupRanges();
     void findJointEnds();
     void findFreeParticles(const std::vector<char>& isInBatch);
@@ -328,6 +330,7 @@ private:
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
     std::vector<double> masses, inverseMasses;
+    ClusterLayout layout;
     std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning
     std::vector<int> givenIndex;                 // internal order -> order of the constructor
     std::vector<double> inverseSquareLengths, multiplierFactors;
