@@ -410,19 +410,14 @@ template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& s
             store(lanes, k, multipliers[k], step.lambda);
         if (step.lambdaHalf == nullptr)
             continue;
-        addConstraintForces(shape, factor, multipliers, packOf(-1), acceleration);
         for (int k = 0; k < B; k++) {
             const PackVector velocity = bondOf(w, k);
             x[k] = dot(velocity, velocity) * shape.inverseSquareLength[k] + applied[k];
             store(lanes, k, x[k], step.rightSideHalf);
-            multipliers[k] = packOf(2) * dot(bondOf(v, k), bondOf(acceleration, k)) * shape.inverseSquareLength[k];
         }
         solve(factor, x);
-        solve(factor, multipliers);
-        for (int k = 0; k < B; k++) {
+        for (int k = 0; k < B; k++)
             store(lanes, k, x[k], step.lambdaHalf);
-            store(lanes, k, multipliers[k], step.lambdaRate);
-        }
     }
     return smallestPivot;
 }

@@ -37,9 +37,8 @@ struct OnStepArrays {
     OpenMM::Vec3* v; // M^-1 p[n+1]
     double* lambda; // Lambda(q[n+1], p[n+1])
     double* rightSide; // K times it
-    double* lambdaHalf; // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and then none of the following
+    double* lambdaHalf; // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and so is the following
     double* rightSideHalf; // K times it
-    double* lambdaRate; // the derivative of Lambda(q[n+1], p) along dp = F - G^T Lambda
     double kick; // of (3.12), h/(2 rho)
 };
 

@@ -198,7 +198,7 @@ struct ConstraintSolver::CoupledPass : Pass {
     StepArrays arrays;
 };
 
-// The end of a step. Stages: (3.13), (4.3), and what multipliers at half-step velocities take.
+// The end of a step. Stages: (3.13), and (4.3) at one or two velocities.
 struct ConstraintSolver::FinishPass : Pass {
     FinishPass(ConstraintSolver& solver, const OnStep& state, Observer* observer) :
             Pass(solver, observer), state(state), half(state.atHalfStep), jacobian(solver.jacobianNext),
@@ -210,11 +210,10 @@ struct ConstraintSolver::FinishPass : Pass {
                    state.rightSide.data(),
                    half != nullptr ? half->multipliers.data() : nullptr,
                    half != nullptr ? half->rightSide.data() : nullptr,
-                   half != nullptr ? half->rate.data() : nullptr,
                    state.kick} {
     }
     int numStages() const {
-        return half != nullptr ? 3 : 2;
+        return 2;
     }
     const ConstraintSystem::Jacobian* toFactorize() const {
         return &jacobian;
@@ -233,32 +232,19 @@ struct ConstraintSolver::FinishPass : Pass {
         if (stage == 0) // (3.12)
             for (int p = part.firstParticle; p < part.endParticle; p++)
                 runFree(particles[p]);
-        else if (stage == 1)
+        else
             system.addTransposedOverMass(jacobian, solver.correction, -1.0, state.velocities, part);
-        else { // dv = M^-1 (F - G^T Lambda)
-            for (int p = part.firstParticle; p < part.endParticle; p++)
-                solver.acceleration[particles[p]] =
-                    state.forces[particles[p]] * system.getInverseMasses()[particles[p]];
-            system.addTransposedOverMass(jacobian, state.multipliers, -1.0, solver.acceleration, part);
-        }
     }
     double form(int stage, const Part& part) const {
         if (stage == 0) { // (3.13)
             system.multiply(jacobian, state.velocities, solver.correction, part);
             system.addParameterMotion(state.positions, state.parameters, solver.correction, part);
         }
-        else if (stage == 1) { // K Lambda = g''(v,v) + G M^-1 F (4.3), at the on-step and the half-step velocities
+        else { // K Lambda = g''(v,v) + G M^-1 F (4.3), at the on-step and the half-step velocities
             system.multiplyOverMass(jacobian, state.forces, solver.appliedTermNext, part);
             formMultiplierEquation(state.velocities, state.rightSide, state.multipliers, part);
             if (half != nullptr)
                 formMultiplierEquation(state.halfStep, half->rightSide, half->multipliers, part);
-        }
-        else { // K dLambda = 2 G(v) dv
-            system.evaluateVelocityJacobian(state.positions, state.velocities, state.parameters,
-                                            solver.velocityJacobian, part);
-            system.multiply(solver.velocityJacobian, solver.acceleration, half->rate, part);
-            for (int k = part.first; k < part.end; k++)
-                half->rate[k] *= 2;
         }
         return 0;
     }
@@ -271,9 +257,7 @@ struct ConstraintSolver::FinishPass : Pass {
     Unknowns unknowns(int stage) const {
         if (stage == 0)
             return {&solver.correction, nullptr};
-        if (stage == 1)
-            return {&state.multipliers, half != nullptr ? &half->multipliers : nullptr};
-        return {&half->rate, nullptr};
+        return {&state.multipliers, half != nullptr ? &half->multipliers : nullptr};
     }
     const OnStep& state;
     HalfStep* half;
@@ -765,12 +749,6 @@ void ConstraintSolver::subtractConstraintForces(const Vectors& positions, const 
              [](int) {}, [&](const Part& part, Result&) { subtract(part); },
              [&](const Part& piece, Result&) { subtract(piece); });
     work.runOnJoints([&](const CutCluster& cluster) { subtract(cluster.joints); });
-}
-
-void ConstraintSolver::subtractConstraintAccelerations(const Vectors& positions, const ExpressionParameters& parameters,
-                                                       const vector<double>& x, Vectors& accelerations) {
-    system.evaluateJacobian(positions, parameters, velocityJacobian);
-    system.addTransposedOverMass(velocityJacobian, x, -1.0, accelerations);
 }
 
 // --------------------------------------------------------------------------------------------------------- explanations

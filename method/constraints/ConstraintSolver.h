@@ -218,7 +218,6 @@ public:
     /** The multipliers at half-step velocities. */
     struct HalfStep {
         std::vector<double> multipliers, rightSide; // Lambda(q,p-) and K times it
-        std::vector<double> rate; // the derivative of Lambda(q,p) along dp = F - G^T Lambda
     };
     /** The end of a step: (3.12)-(3.13), v = w + kick M^-1 F, projected, and Lambda(q,p) there. */
     struct OnStep {
@@ -259,9 +258,6 @@ public:
     /** forces -= G(q)^T x */
     void subtractConstraintForces(const Vectors& q, const ExpressionParameters& theta, const std::vector<double>& x,
                                   Vectors& forces);
-    /** accelerations -= M^-1 G(q)^T x */
-    void subtractConstraintAccelerations(const Vectors& q, const ExpressionParameters& theta,
-                                         const std::vector<double>& x, Vectors& accelerations);
 
 private:
     typedef ConstraintSystem::Part Part;

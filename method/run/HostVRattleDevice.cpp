@@ -30,6 +30,10 @@ void HostVRattleDevice::setMethod(const IntegratorSettings& from) {
     to.calibrationSteps = from.calibrationSteps;
     if (from.isAutomatic)
         std::copy(std::begin(from.automaticReferences), std::end(from.automaticReferences), to.automaticReferences);
+    if (vrattle.getConstraintSystem().getNumConstraints() == 0 && StepMonitor::needConstraints(to.terms))
+        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
+                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
+                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
     vrattle.setSettings(to);
     settings = to;
 }
@@ -47,7 +51,7 @@ void HostVRattleDevice::beginTrial(double stepSize, bool isBackwards) {
         v *= direction;
     try {
         vrattle.setSettings(fixed);
-        vrattle.begin(trial->kept.positions, velocities, trial->kept.forces, trial->kept.groupEnergy);
+        vrattle.begin(trial->kept.state.q, velocities, trial->kept.state.force, trial->kept.state.groupEnergy);
     }
     catch (...) {
         endTrial();

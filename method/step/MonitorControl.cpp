@@ -16,52 +16,50 @@ namespace {
 // A relative change of u that starts no oscillation to speak of: the density is not scaled for it, which would cost reversibility.
 const double SMALL_JUMP = 0.01;
 
+// The smooth sequence's value half a step after the start, from the values at the start, one step ahead and one back.
+double startValue(double start, double ahead, const double* back) {
+    const double value = back != nullptr ? start + 0.25 * (ahead - *back) : 0.5 * (start + ahead);
+    // What changes by its own size within the first step is not resolved: take it as it is.
+    return value > 0.5 * start && value < 2 * start ? value : start;
+}
+
 } // namespace
 
 MonitorControl::MonitorControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
-        StepControl(constraints, solver, now), monitor(constraints), observer(monitor), mustForget(false), u(1),
-        hasHalfStepValue(false), halfStepValue(0), rate(0), densityOffset(0), firstDensity(0), isCalm(false),
-        isMonitorCurrent(false), densityScale(1), isRescued(false), numRescues(0), isStart(false), hasBack(false) {
+        StepControl(constraints, solver, now), monitor(constraints), mustForget(false), isMonitorCurrent(false),
+        numRescues(0), seenForces(nullptr), seenMultipliers(nullptr), seenRightSide(nullptr), seenHalf(nullptr),
+        sums(monitor.makeSums()), halfSums(sums), densityScale(1), isRescued(false), isStart(false), hasBack(false),
+        isCalm(false), firstDensity(0) {
     const ConstraintSystem& system = constraints.getSystem();
     for (vector<double>* numbers : {&multiplierTrial, &rightSideTrial, &back.lambda, &back.rightSide})
         numbers->resize(system.getNumConstraints());
-    for (vector<Vec3>* vectors : {&acceleration, &back.q, &back.w, &back.v, &back.force})
+    for (vector<Vec3>* vectors : {&back.q, &back.w, &back.v, &back.force})
         vectors->resize(system.getNumParticles());
 }
 
 // -------------------------------------------------------------------------------------------------------- the settings
 
-void MonitorControl::requireConstraintsFor(const vector<StepMonitor::Term>& terms, const ConstraintSystem& system) {
-    if (system.getNumConstraints() == 0 && StepMonitor::needConstraints(terms))
-        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
-                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
-                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
-}
-
 bool MonitorControl::setSettings(const StepSettings& next, bool isInForce) {
-    bool sameTerms =
-        isInForce && next.terms.size() == settings.terms.size() && next.isFixedStep == settings.isFixedStep;
-    bool retakeReference = false;
+    const bool isOther =
+        !isInForce || next.isFixedStep != settings.isFixedStep ||
+        !std::equal(next.terms.begin(), next.terms.end(), settings.terms.begin(), settings.terms.end(),
+                    [](const StepMonitor::Term& a, const StepMonitor::Term& b) { return a.isLike(b); });
     vector<StepMonitor::Term> terms = next.terms;
-    for (size_t i = 0; i < terms.size() && sameTerms; i++) {
-        const StepMonitor::Term& old = settings.terms[i];
-        sameTerms = terms[i].kind == old.kind && terms[i].weight == old.weight && terms[i].power == old.power &&
-                    terms[i].order == old.order;
-        if (terms[i].reference == 0 && old.reference == 0)
-            terms[i].reference = monitor.getTerms()[i].reference; // taken at the first step, and still in force
-        else if (terms[i].reference == 0)
-            retakeReference = true;
+    bool areReferencesSame = true;
+    mustForget = isOther;
+    for (size_t k = 0; k < terms.size() && !isOther; k++) {
+        const double given = settings.terms[k].reference, inForce = monitor.getTerms()[k].reference;
+        if (terms[k].reference == 0 && given == 0)
+            terms[k].reference = inForce; // taken at the first step, and so it stays
+        else if (terms[k].reference == 0)
+            mustForget = true;
+        areReferencesSame = areReferencesSame && terms[k].reference == inForce;
     }
-    if (!sameTerms)
-        terms = next.terms;
-    bool sameDensity = sameTerms && !retakeReference && next.stepSize == settings.stepSize &&
-                       next.minimumStep == settings.minimumStep && next.maximumStep == settings.maximumStep &&
-                       next.update == settings.update;
-    for (size_t i = 0; i < terms.size() && sameDensity; i++)
-        sameDensity = terms[i].reference == monitor.getTerms()[i].reference;
-    mustForget = !sameTerms || retakeReference;
+    const bool goesOn = !mustForget && areReferencesSame && next.stepSize == settings.stepSize &&
+                        next.minimumStep == settings.minimumStep && next.maximumStep == settings.maximumStep &&
+                        next.update == settings.update;
     applySettings(next, terms);
-    return sameDensity;
+    return goesOn;
 }
 
 void MonitorControl::applySettings(const StepSettings& newSettings, const vector<StepMonitor::Term>& terms) {
@@ -93,28 +91,20 @@ void MonitorControl::setReferences(const vector<double>& references) {
 }
 
 void MonitorControl::getMemory(StepMemory& memory) const {
+    static_cast<MonitorMemory&>(memory) = *this;
     memory.hasDensity = hasDensity;
     memory.density = rho;
     memory.references = getReferences();
     memory.monitorValues = values;
-    memory.hasHalfStepValue = hasHalfStepValue;
-    memory.u = u;
-    memory.halfStepValue = halfStepValue;
-    memory.rate = rate;
-    memory.densityOffset = densityOffset;
 }
 
 void MonitorControl::setMemory(const StepSettings& newSettings, const StepMemory& memory) {
+    static_cast<MonitorMemory&>(*this) = memory;
     applySettings(newSettings, newSettings.terms);
     setReferences(memory.references);
     hasDensity = memory.hasDensity;
     rho = memory.density;
     values = memory.monitorValues;
-    hasHalfStepValue = memory.hasHalfStepValue;
-    u = memory.u;
-    halfStepValue = memory.halfStepValue;
-    rate = memory.rate;
-    densityOffset = memory.densityOffset;
     firstDensity = 0;
     isMonitorCurrent = false;
 }
@@ -130,31 +120,32 @@ void MonitorControl::ensureMonitor() {
 // U_k at the present state
 void MonitorControl::look() {
     ensureMonitor();
-    monitor.evaluate(now.v, now.lambda, monitor.sum({now.lambda, now.rightSide, nullptr}), values);
+    sums = monitor.sum(now.lambda, now.rightSide);
+    monitor.evaluate(now.v, now.lambda, sums, values);
     hasHalfStepValue = false;
 }
 
-double MonitorControl::combineAndLimit(const vector<double>& monitorValues) const {
+double MonitorControl::limit(const vector<double>& monitorValues) const {
     return settings.isFixedStep ? 1.0 : density.limit(monitor.combine(monitorValues));
 }
 
 // u(q,p) with Lambda(q,p) (4.3)
 double MonitorControl::evaluateU(const vector<Vec3>& velocities, const ExpressionParameters& theta) {
     constraints.findMultipliers(velocities, theta, multiplierTrial, rightSideTrial);
-    return evaluateU(velocities, multiplierTrial, monitor.sum({multiplierTrial, rightSideTrial, nullptr}));
+    sums = monitor.sum(multiplierTrial, rightSideTrial);
+    return evaluate(velocities, multiplierTrial);
 }
 
-double MonitorControl::evaluateU(const vector<Vec3>& velocities, const vector<double>& multipliers,
-                                 const StepMonitor::Sums& sums) {
+double MonitorControl::evaluate(const vector<Vec3>& w, const vector<double>& multipliers) {
     ensureMonitor();
-    monitor.evaluate(velocities, multipliers, sums, valuesTrial);
-    return combineAndLimit(valuesTrial);
+    monitor.evaluate(w, multipliers, sums, valuesTrial);
+    return limit(valuesTrial);
 }
 
 void MonitorControl::begin() {
     forget();
     densityOffset = 0;
-    observer.forces = nullptr;
+    seenForces = nullptr;
     measureAt(now, now.force, now.groupEnergy, values);
     isMonitorCurrent = true;
     back.q = now.q; // for the sake of particles without mass, which stay as they are
@@ -185,7 +176,7 @@ void MonitorControl::change(ChangeKind kind, double) {
 void MonitorControl::rescaleDensity(double oldU) {
     if (!hasDensity)
         return;
-    u = combineAndLimit(values);
+    u = limit(values);
     if (u > 0 && oldU > 0)
         rho *= u / oldU;
     else
@@ -197,11 +188,11 @@ void MonitorControl::forget() {
     firstDensity = 0;
 }
 
-void MonitorControl::adopt(double newDensity, const double* newHalfStepValue, double offset) {
+void MonitorControl::adopt(double newDensity, const double* value, double offset) {
     hasDensity = true;
     rho = newDensity;
-    if (newHalfStepValue != nullptr)
-        halfStepValue = *newHalfStepValue;
+    if (value != nullptr)
+        halfStepValue = *value;
     densityOffset = offset;
 }
 
@@ -224,10 +215,6 @@ void MonitorControl::prepare() {
     ensureMonitor(); // after a step that has failed it may have the forces still
     if (!hasDensity && firstDensity == 0)
         referencesBefore = getReferences();
-}
-
-bool MonitorControl::isVariable() const {
-    return hasDensity && !settings.isFixedStep && !monitor.isEmpty();
 }
 
 /*
@@ -259,62 +246,45 @@ void MonitorControl::solve() {
         return solver.solve(rho, rhoNext);
     };
     const double explicitNext = densityScale * StepDensity::sumUpdate(u, rho);
-    const double bounded = density.boundedUpdate(densityScale * u, densityScale * rho);
-    if (settings.isFixedStep || monitor.isEmpty() || settings.update == StepDensity::Bounded) {
-        const bool isFixed = settings.isFixedStep || monitor.isEmpty();
-        if (!solveWith(isFixed ? 1.0 : bounded))
-            throwNotConverged();
-        return;
+    const double bounded = isConstant() ? 1.0 : density.boundedUpdate(densityScale * u, densityScale * rho);
+    if (!isConstant() && settings.update != StepDensity::Bounded) {
+        bool isSolved;
+        if (needsHalfStep()) {
+            const double known = densityScale * (rho - findHalfStepValue());
+            isSolved = solver.solve(*this, {rho, known, explicitNext, densityOffset, rate, bounded}, rhoNext);
+        }
+        else
+            isSolved = explicitNext > 0 && solveWith(explicitNext);
+        if (isSolved && !density.isFarBelowBound(rhoNext))
+            return;
+        isRescued = true; // the sum gave no step, or one far above the maximum
     }
-    bool isSolved;
-    if (needsHalfStep()) {
-        Equation equation(*this);
-        equation.explicitValue = explicitNext;
-        equation.fallBack = bounded;
-        isSolved = solver.solve(equation, rhoNext);
-    }
-    else
-        isSolved = explicitNext > 0 && solveWith(explicitNext);
-    if (isSolved && !density.isFarBelowBound(rhoNext))
-        return;
-    // A rescue: the sum gave no step, or one far above the maximum.
-    if (!solveWith(bounded))
+    if (!solveWith(bounded)) {
+        isRescued = false;
         throwNotConverged();
-    numRescues++;
-    isRescued = true;
+    }
+    numRescues += isRescued;
 }
 
-MonitorControl::Equation::Equation(MonitorControl& control) : control(control) {
-    rho = control.rho;
-    scale = control.densityScale;
-    offset = control.densityOffset;
-    halfStepValue = control.findHalfStepValue();
-    rate = control.rate;
+ConstraintSolver::Observer* MonitorControl::observeTrial(const vector<double>& multipliers,
+                                                         const vector<double>& rightSide) {
+    seenForces = nullptr;
+    seenMultipliers = &multipliers;
+    seenRightSide = &rightSide;
+    seenHalf = nullptr;
+    return this;
 }
 
-ConstraintSolver::Observer* MonitorControl::Equation::observe(const vector<double>& multipliers,
-                                                              const vector<double>& rightSide) {
-    control.observer.forces = nullptr;
-    control.observer.multipliers = &multipliers;
-    control.observer.rightSide = &rightSide;
-    control.observer.half = nullptr;
-    return &control.observer;
-}
-
-double MonitorControl::Equation::evaluate(const vector<Vec3>& w, const vector<double>& multipliers) {
-    return control.evaluateU(w, multipliers, control.observer.sums);
-}
-
-void MonitorControl::Equation::findGradient(const vector<Vec3>& w, const ExpressionParameters& theta,
-                                            const vector<double>& multipliers, vector<Vec3>& gradient) {
-    control.monitor.evaluateGradient(theta, w, multipliers, control.valuesTrial, gradient);
-    const double derivative = control.density.limitDerivative(control.monitor.combine(control.valuesTrial));
+void MonitorControl::findGradient(const vector<Vec3>& w, const ExpressionParameters& theta,
+                                  const vector<double>& multipliers, vector<Vec3>& gradient) {
+    monitor.evaluateGradient(theta, w, multipliers, valuesTrial, gradient);
+    const double derivative = density.limitDerivative(monitor.combine(valuesTrial));
     for (Vec3& each : gradient)
         each *= derivative;
 }
 
 std::string MonitorControl::explainStep() const {
-    if (!hasDensity || monitor.isEmpty())
+    if (!hasDensity || monitor.getTerms().empty())
         return "";
     std::stringstream text;
     text << "; u = U/U_ref was " << u << " before the step and the last one tried was of "
@@ -324,44 +294,41 @@ std::string MonitorControl::explainStep() const {
 
 ConstraintSolver::Observer* MonitorControl::observe(const ConstraintSolver::OnStep& end) {
     isMonitorCurrent = false;
-    observer.forces = &end.forces;
-    observer.multipliers = &end.multipliers;
-    observer.rightSide = &end.rightSide;
-    observer.half = end.atHalfStep;
-    return &observer;
+    observeTrial(end.multipliers, end.rightSide);
+    seenForces = &end.forces;
+    seenHalf = end.atHalfStep;
+    return this;
 }
 
-void MonitorControl::SumObserver::seeParticles(int block) {
-    if (forces != nullptr)
-        monitor.sumForces(*forces, block);
+void MonitorControl::seeParticles(int block) {
+    if (seenForces != nullptr)
+        monitor.sumForces(*seenForces, block);
 }
 
-void MonitorControl::SumObserver::seeConstraints(int range, int first, int end) {
-    monitor.sumRange({*multipliers, *rightSide, half != nullptr ? &half->rate : nullptr}, range, first, end, sums);
-    if (half != nullptr)
-        monitor.sumRange({half->multipliers, half->rightSide, nullptr}, range, first, end, halfSums);
+void MonitorControl::seeConstraints(int range, int first, int end) {
+    monitor.sumRange(*seenMultipliers, *seenRightSide, range, first, end, sums);
+    if (seenHalf != nullptr)
+        monitor.sumRange(seenHalf->multipliers, seenHalf->rightSide, range, first, end, halfSums);
 }
 
 // The monitors at a state that has been observed, or has not.
-void MonitorControl::measureAt(const StepState& state, const vector<Vec3>& forces, double groupEnergy,
+void MonitorControl::measureAt(const StepState& state, const vector<Vec3>& forces, double energy,
                                vector<double>& monitorValues) {
-    if (observer.forces == &forces)
-        monitor.finishForces(forces, groupEnergy);
-    else {
-        monitor.setForces(forces, groupEnergy);
-        observer.sums = monitor.sum({state.lambda, state.rightSide, nullptr});
-    }
-    observer.forces = nullptr;
+    const bool isSeen = seenForces == &forces;
+    monitor.setForces(forces, energy, isSeen);
+    if (!isSeen)
+        sums = monitor.sum(state.lambda, state.rightSide);
+    seenForces = nullptr;
     if (!monitor.hasFiniteForces())
         throw StepFailure("the force on a particle is infinite or not a number");
-    monitor.evaluate(state.v, state.lambda, observer.sums, monitorValues);
+    monitor.evaluate(state.v, state.lambda, sums, monitorValues);
     monitor.requireValid(monitorValues);
 }
 
 bool MonitorControl::measure(const End& end) {
     measureAt(end.state, end.forces, end.groupEnergy, valuesNext);
     if (end.atHalfStep != nullptr)
-        monitor.evaluate(end.state.w, end.atHalfStep->multipliers, observer.halfSums, valuesHalf);
+        monitor.evaluate(end.state.w, end.atHalfStep->multipliers, halfSums, valuesHalf);
     return !isStart || startDensity();
 }
 
@@ -376,8 +343,9 @@ void MonitorControl::accept(const End& end) {
         rhoNext = rho + (rhoNext - rho) * std::min(1.0, end.size / (settings.stepSize / rhoNext));
     hasHalfStepValue = end.atHalfStep != nullptr;
     if (hasHalfStepValue) {
-        halfStepValue = combineAndLimit(valuesHalf);
-        rate = evaluateRate(end);
+        halfStepValue = limit(valuesHalf);
+        // Along F - G^T Lambda, which the last half of the kick has gone along.
+        rate = (limit(valuesNext) - halfStepValue) / (0.5 * end.size);
     }
 }
 
@@ -392,22 +360,8 @@ void MonitorControl::settle(StepKind kind) {
     }
     if (hasDensity) {
         rho = rhoNext;
-        u = combineAndLimit(values);
+        u = limit(values);
     }
-}
-
-// The change of u along F - G^T Lambda, of the on-step state that is about to be taken over.
-double MonitorControl::evaluateRate(const End& end) {
-    const StepState& state = end.state;
-    if (monitor.usesVelocities()) {
-        const vector<double>& inverseMasses = constraints.getSystem().getInverseMasses();
-        for (int i : constraints.getMovingParticles())
-            acceleration[i] = monitor.getForces()[i] * inverseMasses[i];
-        constraints.subtractConstraintAccelerations(state.q, state.theta, state.lambda, acceleration);
-    }
-    return density.limitDerivative(monitor.combine(valuesNext)) *
-           monitor.evaluateRate(state.v, {state.lambda, state.rightSide, &end.atHalfStep->rate}, observer.sums,
-                                valuesNext, acceleration);
 }
 
 void MonitorControl::abandon() {
@@ -439,7 +393,7 @@ void MonitorControl::findFirstDensity() {
     isCalm = false;
     rhoNext = 1;
     const vector<StepMonitor::Term>& terms = monitor.getTerms();
-    if (settings.isFixedStep || terms.empty())
+    if (isConstant())
         return;
     if (firstDensity > 0) {
         rhoNext = firstDensity;
@@ -461,18 +415,29 @@ void MonitorControl::findFirstDensity() {
     }
     isCalm = isCalm || areAllNegligible;
     if (!areAllNegligible && !areAllUnknown && (areAllKnown || isCalm))
-        rhoNext = combineAndLimit(values);
+        rhoNext = limit(values);
 }
 
-void MonitorControl::lookBack(const vector<Vec3>& forces, double groupEnergy, StepKind kind, double size) {
-    isStart = kind == First && !isCalm && !settings.isFixedStep && !monitor.isEmpty();
+void MonitorControl::lookBack(const vector<Vec3>& forces, double energy, StepKind kind, double size) {
+    isStart = kind == First && !isCalm && !isConstant();
     if (!isStart)
         return;
-    hasBack = evaluateBackwards(forces, groupEnergy, size);
-    startValues = hasBack && needsHalfStep() ? evaluateHalfSteps(size) : values;
+    hasBack = lookBehind(forces, energy, size);
+    startValues = values;
+    if (!hasBack || !needsHalfStep())
+        return;
+    // The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
+    const ExpressionParameters& theta = solver.parametersAtRateOf(size);
+    isMonitorCurrent = false; // it has the forces behind
+    evaluateU(solver.next.w, theta);
+    startValues = valuesTrial;
+    evaluateU(back.w, theta);
+    for (size_t k = 0; k < startValues.size(); k++)
+        startValues[k] = 0.5 * (startValues[k] + valuesTrial[k]);
 }
 
-bool MonitorControl::evaluateBackwards(const vector<Vec3>& forces, double groupEnergy, double size) {
+// The state a step behind the start, if there is one.
+bool MonitorControl::lookBehind(const vector<Vec3>& forces, double energy, double size) {
     if (!solver.solveBackwards(size, back))
         return false;
     const ConstraintSystem& system = constraints.getSystem();
@@ -489,24 +454,12 @@ bool MonitorControl::evaluateBackwards(const vector<Vec3>& forces, double groupE
         const ConstraintSolver::OnStep end = {back.q, back.w,      back.force,     back.theta, -0.5 * size,
                                               back.v, back.lambda, back.rightSide, nullptr};
         constraints.finish(end, observe(end));
-        measureAt(back, back.force, now.groupEnergy + alpha * (groupEnergy - now.groupEnergy), backValues);
+        measureAt(back, back.force, now.groupEnergy + alpha * (energy - now.groupEnergy), backValues);
     }
     catch (const StepFailure&) {
-        return false; // no state to look back at
+        return false;
     }
     return true;
-}
-
-// The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
-vector<double> MonitorControl::evaluateHalfSteps(double size) {
-    const ExpressionParameters& theta = solver.parametersAtRateOf(size);
-    isMonitorCurrent = false; // it has the forces behind
-    evaluateU(solver.next.w, theta);
-    vector<double> result = valuesTrial;
-    evaluateU(back.w, theta);
-    for (size_t k = 0; k < result.size(); k++)
-        result[k] = 0.5 * (result[k] + valuesTrial[k]);
-    return result;
 }
 
 // Returns whether the first step stands; if not, firstDensity says with which density to take it again.
@@ -525,8 +478,8 @@ bool MonitorControl::startDensity() {
     }
     if (firstDensity > 0)
         return true;
-    const double back = hasBack ? combineAndLimit(backValues) : 0.0;
-    firstDensity = startValue(combineAndLimit(startValues), combineAndLimit(valuesNext), hasBack ? &back : nullptr);
+    const double back = hasBack ? limit(backValues) : 0.0;
+    firstDensity = startValue(limit(startValues), limit(valuesNext), hasBack ? &back : nullptr);
     return std::fabs(firstDensity - rhoNext) <= 1e-12 * rhoNext;
 }
 
@@ -537,8 +490,8 @@ void MonitorControl::scaleReferences() {
     auto mismatchOf = [&](double scale) {
         for (size_t k = 0; k < references.size(); k++)
             monitor.setReference((int) k, scale * references[k]);
-        const double start = combineAndLimit(startValues);
-        return start + 0.25 * (combineAndLimit(valuesNext) - combineAndLimit(backValues)) / start - 1;
+        const double start = limit(startValues);
+        return start + 0.25 * (limit(valuesNext) - limit(backValues)) / start - 1;
     };
     double last = 1, scale = 1.001, lastMismatch = mismatchOf(last);
     for (int iteration = 0; iteration < 20; iteration++) { // the secant method
@@ -553,11 +506,4 @@ void MonitorControl::scaleReferences() {
     // Where the monitor is not resolved the scale is left alone.
     if (!(std::fabs(mismatchOf(scale)) < 1e-6))
         mismatchOf(1);
-}
-
-// The smooth sequence's value half a step after the start, from the values at the start, one step ahead and one back.
-double MonitorControl::startValue(double start, double ahead, const double* back) {
-    const double value = back != nullptr ? start + 0.25 * (ahead - *back) : 0.5 * (start + ahead);
-    // What changes by its own size within the first step is not resolved: take it as it is.
-    return value > 0.5 * start && value < 2 * start ? value : start;
 }

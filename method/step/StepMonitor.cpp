@@ -3,8 +3,6 @@
 
 #include "step/StepMonitor.h"
 #include <algorithm>
-#include <cmath>
-#include <initializer_list>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -12,105 +10,115 @@ using std::vector;
 
 namespace {
 
-bool usesConstraintsOnly(StepMonitor::Kind kind) {
-    return kind == StepMonitor::ConstraintMultipliers || kind == StepMonitor::ConstraintForce ||
-           kind == StepMonitor::MultiplierPNorm;
+enum Norm { Square, Power, Largest, Energy };
+/** How the square of a particle's force or velocity counts. */
+enum Weight { No, One, Mass, OverMass };
+
+/** What a monitor is the norm of, with d_k Lambda_k the multipliers in users' units. */
+struct Parts {
+    Norm norm;
+    bool constraintForce, multipliers; // Lambda^T K Lambda; (d_k Lambda_k)^2
+    Weight force, velocity;            // |F_i|^2; |v_i|^2
+    bool ofConstraints() const {
+        return constraintForce || multipliers;
+    }
+};
+
+Parts partsOf(StepMonitor::Kind kind) {
+    switch (kind) {
+    case StepMonitor::ConstraintMultipliers: // (4.4)
+        return {Square, false, true, No, No};
+    case StepMonitor::ConstraintForce:
+        return {Square, true, false, No, No};
+    case StepMonitor::AppliedForce:
+        return {Square, false, false, OverMass, No};
+    case StepMonitor::ConstraintAndAppliedForce:
+        return {Square, true, false, OverMass, No};
+    case StepMonitor::MultiplierPNorm:
+        return {Power, false, true, No, No};
+    case StepMonitor::ForcePNorm:
+        return {Power, false, false, One, No};
+    case StepMonitor::VectorField: // (4.1)
+        return {Square, false, false, One, Mass};
+    case StepMonitor::MaxForce:
+        return {Largest, false, false, One, No};
+    case StepMonitor::ArcLength:
+        return {Square, false, false, One, One};
+    case StepMonitor::MaxParticleArcLength:
+        return {Largest, false, false, One, One};
+    case StepMonitor::ForceGroupEnergy:
+        break;
+    }
+    return {Energy, false, false, No, No};
 }
 
-bool usesMultipliers(StepMonitor::Kind kind) {
-    return usesConstraintsOnly(kind) || kind == StepMonitor::ConstraintAndAppliedForce;
+bool anyOf(const vector<StepMonitor::Term>& terms, bool (*isWanted)(const Parts&)) {
+    return std::any_of(terms.begin(), terms.end(),
+                       [&](const StepMonitor::Term& term) { return isWanted(partsOf(term.kind)); });
 }
 
-bool isOfVelocities(StepMonitor::Kind kind) {
-    return kind == StepMonitor::VectorField || kind == StepMonitor::ArcLength ||
-           kind == StepMonitor::MaxParticleArcLength;
+double total(const vector<double>& parts) {
+    return sumOf((int) parts.size(), [&](int k) { return parts[k]; });
 }
 
 } // namespace
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
-        solver(solver), system(solver.getSystem()), forces(nullptr), groupEnergy(0), appliedForceSquared(0),
-        forceSquared(0), maxForce(0), constraintForceSquared(0), multipliersSquared(0),
-        blockSums(system.getBlocks().size() - 1), blockAppliedSums(blockSums.size()), blockLargest(blockSums.size()),
+        solver(solver), system(solver.getSystem()), forces(nullptr), groupEnergy(0), forceSquared(0),
+        appliedForceSquared(0), constraintForceSquared(0), multipliersSquared(0),
+        blockSums(system.getBlocks().size() - 1), blockAppliedSums(blockSums.size()),
         toSolve(system.getNumConstraints()), solved(system.getNumConstraints()) {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms) {
     terms = newTerms;
-    forcePNorms.assign(terms.size(), 0.0);
-}
-
-bool StepMonitor::needsMultipliers() const {
-    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesMultipliers(term.kind); });
+    forceNorms.assign(terms.size(), 0.0);
 }
 
 bool StepMonitor::needConstraints(const vector<Term>& terms) {
-    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return usesConstraintsOnly(term.kind); });
-}
-
-void StepMonitor::requireValid(const vector<double>& values) const {
-    for (size_t k = 0; k < terms.size(); k++)
-        if (!(values[k] >= 0) || !std::isfinite(values[k]))
-            throw StepFailure("monitor " + std::to_string(k) + " became " + std::to_string(values[k]) +
-                              (terms[k].kind == ForceGroupEnergy
-                                   ? ", while the energy of the monitor's force group must stay positive"
-                                   : ", while a monitor must stay positive and finite"));
+    return anyOf(terms, [](const Parts& parts) { return parts.ofConstraints() && parts.force == No; });
 }
 
 bool StepMonitor::dependsOnVelocities() const {
-    return std::any_of(terms.begin(), terms.end(),
-                       [](const Term& term) { return usesMultipliers(term.kind) || isOfVelocities(term.kind); });
+    return anyOf(terms, [](const Parts& parts) { return parts.ofConstraints() || parts.velocity != No; });
 }
 
 bool StepMonitor::usesVelocities() const {
-    return std::any_of(terms.begin(), terms.end(), [](const Term& term) { return isOfVelocities(term.kind); });
+    return anyOf(terms, [](const Parts& parts) { return parts.velocity != No; });
 }
 
-void StepMonitor::setForces(const vector<Vec3>& newForces, double energy) {
-    for (size_t block = 0; block < blockSums.size(); block++)
-        sumForces(newForces, (int) block);
-    finishForces(newForces, energy);
-}
+// ------------------------------------------------------------------------------------------------------------ the sums
 
 // The force on a particle that does not move is of no interest, even if it is not a number.
 double StepMonitor::squareOf(const Vec3& force, int particle) const {
     return system.getInverseMasses()[particle] > 0 ? force.dot(force) : 0.0;
 }
 
-bool StepMonitor::isWanted(std::initializer_list<Kind> kinds) const {
-    return std::any_of(terms.begin(), terms.end(), [&](const Term& term) {
-        return std::find(kinds.begin(), kinds.end(), term.kind) != kinds.end();
-    });
-}
-
 void StepMonitor::sumForces(const vector<Vec3>& newForces, int block) {
     const int first = system.getBlocks()[block].particle, end = system.getBlocks()[block + 1].particle;
-    const vector<double>& inverseMasses = system.getInverseMasses();
+    const double* inverseMasses = system.getInverseMasses().data() + first;
     auto square = [&](int i) { return squareOf(newForces[first + i], first + i); };
     blockSums[block] = sumOf(end - first, square);
-    if (isWanted({AppliedForce, ConstraintAndAppliedForce}))
-        blockAppliedSums[block] = sumOf(end - first, [&](int i) { return square(i) * inverseMasses[first + i]; });
-    if (isWanted({MaxForce})) {
-        blockLargest[block] = 0;
-        for (int i = 0; i < end - first; i++)
-            blockLargest[block] = std::max(blockLargest[block], square(i));
-    }
+    if (anyOf(terms, [](const Parts& parts) { return parts.force == OverMass; }))
+        blockAppliedSums[block] = sumOf(end - first, [&](int i) { return square(i) * inverseMasses[i]; });
 }
 
-void StepMonitor::finishForces(const vector<Vec3>& newForces, double energy) {
+void StepMonitor::setForces(const vector<Vec3>& newForces, double energy, bool areSummed) {
+    for (size_t block = 0; block < blockSums.size() && !areSummed; block++)
+        sumForces(newForces, (int) block);
     forces = &newForces;
     groupEnergy = energy;
-    const int numBlocks = (int) blockSums.size();
-    forceSquared = sumOf(numBlocks, [&](int block) { return blockSums[block]; });
-    appliedForceSquared = sumOf(numBlocks, [&](int block) { return blockAppliedSums[block]; });
-    maxForce = 0;
-    for (double square : blockLargest)
-        maxForce = std::max(maxForce, square);
-    maxForce = std::sqrt(maxForce);
-    for (size_t k = 0; k < terms.size(); k++)
-        if (terms[k].kind == ForcePNorm)
-            forcePNorms[k] = pNorm(system.getNumParticles(), terms[k].order,
-                                   [&](int i) { return std::sqrt(squareOf(newForces[i], i)); });
+    forceSquared = total(blockSums);
+    appliedForceSquared = total(blockAppliedSums);
+    const int numParticles = system.getNumParticles();
+    auto square = [&](int i) { return squareOf(newForces[i], i); };
+    for (size_t k = 0; k < terms.size(); k++) {
+        const Parts parts = partsOf(terms[k].kind);
+        if (parts.norm == Power && parts.force == One)
+            forceNorms[k] = pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(square(i)); });
+        else if (parts.norm == Largest && parts.velocity == No)
+            forceNorms[k] = std::sqrt(solver.largest(numParticles, square));
+    }
 }
 
 // (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
@@ -123,190 +131,84 @@ template <class Size> double StepMonitor::pNorm(int count, double order, const S
 
 StepMonitor::Sums StepMonitor::makeSums() const {
     const vector<double> zeros(solver.getNumRanges(), 0.0);
-    return {zeros, zeros, zeros, zeros};
+    return {zeros, zeros};
 }
 
-void StepMonitor::sumRange(const Multipliers& at, int range, int first, int end, Sums& sums) const {
-    const double *lambda = at.multipliers.data() + first, *right = at.rightSide.data() + first;
+void StepMonitor::sumRange(const vector<double>& multipliers, const vector<double>& rightSide, int range, int first,
+                           int end, Sums& sums) const {
+    const double *lambda = multipliers.data() + first, *right = rightSide.data() + first;
     sums.forces[range] = sumOf(end - first, [&](int k) { return lambda[k] * right[k]; });
-    const double* rate = at.rate != nullptr ? at.rate->data() + first : nullptr;
-    if (rate != nullptr)
-        sums.forceRates[range] = sumOf(end - first, [&](int k) { return right[k] * rate[k]; });
-    if (!isWanted({ConstraintMultipliers}))
-        return;
-    auto given = [&](int k, double x) { return system.toGivenMultiplier(first + k) * x; };
-    sums.multipliers[range] = sumOf(end - first, [&](int k) { return given(k, lambda[k]) * given(k, lambda[k]); });
-    if (rate != nullptr)
-        sums.multiplierRates[range] =
-            sumOf(end - first, [&](int k) { return given(k, lambda[k]) * given(k, rate[k]); });
+    if (anyOf(terms, [](const Parts& parts) { return parts.multipliers && parts.norm == Square; }))
+        sums.multipliers[range] = sumOf(end - first, [&](int k) {
+            const double given = system.toGivenMultiplier(first + k) * lambda[k];
+            return given * given;
+        });
 }
 
-StepMonitor::Sums StepMonitor::sum(const Multipliers& at) const {
+StepMonitor::Sums StepMonitor::sum(const vector<double>& multipliers, const vector<double>& rightSide) const {
     Sums sums = makeSums();
-    solver.forRanges([&](int range, int first, int end) { sumRange(at, range, first, end, sums); });
+    solver.forRanges([&](int range, int first, int end) { sumRange(multipliers, rightSide, range, first, end, sums); });
     return sums;
+}
+
+// ---------------------------------------------------------------------------------------------------------- the values
+
+double StepMonitor::sumOfForces(Kind kind) const {
+    const Weight weight = partsOf(kind).force;
+    return weight == One ? forceSquared : weight == OverMass ? appliedForceSquared : 0.0;
 }
 
 void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const Sums& sums,
                            vector<double>& values) {
-    auto add = [](const vector<double>& parts) {
-        return sumOf((int) parts.size(), [&](int range) { return parts[range]; });
-    };
     // Lambda^T K Lambda; rounding could make it negative where it vanishes.
-    const double sum = add(sums.forces);
+    const double sum = total(sums.forces);
     constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
-    multipliersSquared = add(sums.multipliers);
-    values.resize(terms.size());
-    for (size_t i = 0; i < terms.size(); i++)
-        values[i] = evaluateTerm(i, v, multipliers);
-}
-
-// du/dU_k
-double StepMonitor::derivativeOfU(size_t index, const vector<double>& values, double u) const {
-    const Term& term = terms[index];
-    // U is not differentiable at zero; any value serves, since it only guides the iteration.
-    if (!(values[index] > 0) || !(u > 0) || term.reference == 0)
-        return 0;
-    double sumOfWeights = 0;
-    for (const Term& each : terms)
-        sumOfWeights += each.weight * each.weight;
-    double t = term.weight * std::pow(values[index] / term.reference, term.power);
-    return t * t * term.power / (values[index] * u * sumOfWeights);
-}
-
-int StepMonitor::findFastest(const vector<Vec3>& v) const {
-    int fastest = 0;
-    double largest = -1;
-    for (int i = 0; i < system.getNumParticles(); i++) {
-        double square = v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]);
-        if (system.getInverseMasses()[i] > 0 && square > largest) {
-            largest = square;
-            fastest = i;
-        }
-    }
-    return fastest;
-}
-
-double StepMonitor::evaluateRate(const vector<Vec3>& v, const Multipliers& at, const Sums& sums,
-                                 const vector<double>& values, const vector<Vec3>& velocityRate) const {
-    const int numParticles = system.getNumParticles();
-    auto add = [](const vector<double>& parts) {
-        return sumOf((int) parts.size(), [&](int range) { return parts[range]; });
-    };
-    const double u = combine(values);
-    double rate = 0;
-    for (size_t i = 0; i < terms.size(); i++) {
-        const double factor = derivativeOfU(i, values, u), value = values[i];
-        if (factor == 0)
-            continue;
-        switch (terms[i].kind) {
-        case ConstraintMultipliers:
-            rate += factor * add(sums.multiplierRates) / value;
-            break;
-        case MultiplierPNorm:
-            rate += factor * solver.sum(system.getNumConstraints(), [&](int k) {
-                const double x = system.toGivenMultiplier(k) * at.multipliers[k];
-                return std::copysign(std::pow(std::fabs(x) / value, terms[i].order - 1), x) *
-                       system.toGivenMultiplier(k) * (*at.rate)[k];
-            });
-            break;
-        case ConstraintForce:
-        case ConstraintAndAppliedForce:
-            rate += factor * add(sums.forceRates) / value;
-            break;
-        case VectorField:
-            rate += factor / value * solver.sum(numParticles, [&](int p) {
-                return system.getMasses()[p] > 0 ? system.getMasses()[p] * v[p].dot(velocityRate[p]) : 0.0;
-            });
-            break;
-        case ArcLength:
-            rate += factor / value * solver.sum(numParticles, [&](int p) {
-                return system.getMasses()[p] > 0 ? v[p].dot(velocityRate[p]) : 0.0;
-            });
-            break;
-        case MaxParticleArcLength: {
-            const int fastest = findFastest(v);
-            rate += factor * v[fastest].dot(velocityRate[fastest]) / value;
-            break;
-        }
-        case AppliedForce:
-        case ForcePNorm:
-        case MaxForce:
-        case ForceGroupEnergy:
-            break;
-        }
-    }
-    return rate;
-}
-
-double StepMonitor::evaluateTerm(size_t index, const vector<Vec3>& v, const vector<double>& multipliers) const {
-    const Term& term = terms[index];
-    const vector<double>& masses = system.getMasses();
+    multipliersSquared = total(sums.multipliers);
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
-    auto givenMultiplier = [&](int k) { return multipliers[k] * system.toGivenMultiplier(k); };
-    switch (term.kind) {
-    case ConstraintMultipliers: // (4.4)
-        return std::sqrt(multipliersSquared);
-    case ConstraintForce:
-        return std::sqrt(constraintForceSquared);
-    case AppliedForce:
-        return std::sqrt(appliedForceSquared);
-    case ConstraintAndAppliedForce:
-        return std::sqrt(constraintForceSquared + appliedForceSquared);
-    case MultiplierPNorm:
-        return pNorm(numConstraints, term.order, [&](int k) { return std::fabs(givenMultiplier(k)); });
-    case ForcePNorm:
-        return forcePNorms[index];
-    case VectorField: // (4.1)
-        return std::sqrt(forceSquared + solver.sum(numParticles, [&](int i) {
-            return masses[i] > 0 ? masses[i] * v[i].dot(v[i]) : 0.0;
-        }));
-    case MaxForce:
-        return maxForce;
-    case ArcLength:
-        return std::sqrt(forceSquared +
-                         solver.sum(numParticles, [&](int i) { return masses[i] > 0 ? v[i].dot(v[i]) : 0.0; }));
-    case MaxParticleArcLength:
-        return std::sqrt(solver.largest(numParticles, [&](int i) {
-            return masses[i] > 0 ? v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]) : 0.0;
-        }));
-    case ForceGroupEnergy:
-        return groupEnergy;
+    const vector<double>& masses = system.getMasses();
+    values.resize(terms.size());
+    for (size_t k = 0; k < terms.size(); k++) {
+        const Parts parts = partsOf(terms[k].kind);
+        auto square = [&](int i) {
+            return masses[i] > 0 ? (parts.velocity == Mass ? masses[i] : 1.0) * v[i].dot(v[i]) : 0.0;
+        };
+        if (parts.norm == Square)
+            values[k] = std::sqrt((parts.constraintForce ? constraintForceSquared : 0.0) +
+                                  (parts.multipliers ? multipliersSquared : 0.0) + sumOfForces(terms[k].kind) +
+                                  (parts.velocity != No ? solver.sum(numParticles, square) : 0.0));
+        else if (parts.norm == Power && parts.multipliers)
+            values[k] = pNorm(numConstraints, terms[k].order,
+                              [&](int j) { return std::fabs(system.toGivenMultiplier(j) * multipliers[j]); });
+        else if (parts.norm == Largest && parts.velocity != No)
+            values[k] =
+                std::sqrt(solver.largest(numParticles, [&](int i) { return square(i) + squareOf((*forces)[i], i); }));
+        else
+            values[k] = parts.norm == Energy ? groupEnergy : forceNorms[k];
     }
-    return 0;
+}
+
+void StepMonitor::requireValid(const vector<double>& values) const {
+    for (size_t k = 0; k < terms.size(); k++)
+        if (!(values[k] >= 0) || !std::isfinite(values[k]))
+            throw StepFailure("monitor " + std::to_string(k) + " became " + std::to_string(values[k]) +
+                              (terms[k].kind == ForceGroupEnergy
+                                   ? ", while the energy of the monitor's force group must stay positive"
+                                   : ", while a monitor must stay positive and finite"));
 }
 
 bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v, double speed,
                                double acceleration) const {
     if (!(value > 0))
         return true;
-    switch (terms[index].kind) {
-    case ConstraintMultipliers:
-    case MultiplierPNorm:
-        return value <= solver.findMultiplierRounding(false, v, acceleration);
-    case ConstraintForce:
-        return value <= solver.findMultiplierRounding(true, v, acceleration);
-    case ConstraintAndAppliedForce:
-        return areForcesNegligible(acceleration) &&
-               value * value - appliedForceSquared <= std::pow(solver.findMultiplierRounding(true, v, acceleration), 2);
-    case AppliedForce:
-    case ForcePNorm:
-    case MaxForce:
-        return areForcesNegligible(acceleration);
-    case VectorField:
-    case ArcLength:
-    case MaxParticleArcLength:
-        return areForcesNegligible(acceleration) &&
-               std::all_of(v.begin(), v.end(), [&](const Vec3& each) { return each.dot(each) <= speed * speed; });
-    case ForceGroupEnergy:
-        break;
-    }
-    return false;
-}
-
-bool StepMonitor::areForcesNegligible(double acceleration) const {
+    const Parts parts = partsOf(terms[index].kind);
+    if (parts.norm == Energy)
+        return false;
+    if (parts.ofConstraints() && value * value - sumOfForces(terms[index].kind) >
+                                     std::pow(solver.findMultiplierRounding(parts.constraintForce, v, acceleration), 2))
+        return false;
     for (int i = 0; i < system.getNumParticles(); i++)
-        if (squareOf((*forces)[i], i) > std::pow(system.getMasses()[i] * acceleration, 2))
+        if ((parts.force != No && squareOf((*forces)[i], i) > std::pow(system.getMasses()[i] * acceleration, 2)) ||
+            (parts.velocity != No && system.getMasses()[i] > 0 && !(v[i].dot(v[i]) <= speed * speed)))
             return false;
     return true;
 }
@@ -324,6 +226,21 @@ double StepMonitor::combine(const vector<double>& values) const {
     return std::sqrt(sum / sumOfWeights);
 }
 
+// -------------------------------------------------------------------------------------------------------- the gradient
+
+// du/dU_k
+double StepMonitor::derivativeOfU(size_t index, const vector<double>& values, double u) const {
+    const Term& term = terms[index];
+    // U is not differentiable at zero; any value serves, since it only guides the iteration.
+    if (!(values[index] > 0) || !(u > 0) || term.reference == 0)
+        return 0;
+    double sumOfWeights = 0;
+    for (const Term& each : terms)
+        sumOfWeights += each.weight * each.weight;
+    const double t = term.weight * std::pow(values[index] / term.reference, term.power);
+    return t * t * term.power / (values[index] * u * sumOfWeights);
+}
+
 void StepMonitor::evaluateGradient(const ExpressionParameters& theta, const vector<Vec3>& v,
                                    const vector<double>& multipliers, const vector<double>& values,
                                    vector<Vec3>& gradient) {
@@ -333,66 +250,40 @@ void StepMonitor::evaluateGradient(const ExpressionParameters& theta, const vect
     // du/dLambda is collected in two parts: y, which needs a product with K^-1, and x, which is K^-1 du/dLambda already.
     std::fill(toSolve.begin(), toSolve.end(), 0.0);
     std::fill(solved.begin(), solved.end(), 0.0);
-    bool mustSolve = false;
     const double u = combine(values);
-    for (size_t i = 0; i < terms.size(); i++) {
-        const Term& term = terms[i];
-        const double value = values[i], factor = derivativeOfU(i, values, u);
+    for (size_t k = 0; k < terms.size(); k++) {
+        const Parts parts = partsOf(terms[k].kind);
+        const double value = values[k], factor = derivativeOfU(k, values, u);
         if (factor == 0)
             continue;
-        switch (term.kind) {
-        case ConstraintMultipliers:
-            mustSolve = true;
-            for (int k = 0; k < numConstraints; k++) {
-                double d = system.toGivenMultiplier(k);
-                toSolve[k] += factor / value * d * d * multipliers[k];
+        if (parts.multipliers)
+            for (int j = 0; j < numConstraints; j++) {
+                const double d = system.toGivenMultiplier(j), x = d * multipliers[j] / value;
+                const double order = parts.norm == Power ? terms[k].order : 2.0;
+                toSolve[j] += factor * d * std::copysign(std::pow(std::fabs(x), order - 1), x);
             }
-            break;
-        case MultiplierPNorm:
-            mustSolve = true;
-            for (int k = 0; k < numConstraints; k++) {
-                double d = system.toGivenMultiplier(k), size = std::fabs(d * multipliers[k]);
-                double derivative = d * std::pow(size / value, term.order - 1);
-                toSolve[k] += factor * (multipliers[k] < 0 ? -derivative : derivative);
-            }
-            break;
-        case ConstraintForce:
-        case ConstraintAndAppliedForce:
-            // dU/dLambda = K Lambda/U
-            for (int k = 0; k < numConstraints; k++)
-                solved[k] += factor / value * multipliers[k];
-            break;
-        case VectorField:
-            for (int p = 0; p < numParticles; p++)
-                if (masses[p] > 0)
-                    gradient[p] += v[p] * (factor / value * masses[p]);
-            break;
-        case ArcLength:
-            for (int p = 0; p < numParticles; p++)
-                if (masses[p] > 0)
-                    gradient[p] += v[p] * (factor / value);
-            break;
-        case MaxParticleArcLength: {
-            const int fastest = findFastest(v);
-            gradient[fastest] += v[fastest] * (factor / value);
-            break;
+        if (parts.constraintForce) // dU/dLambda = K Lambda/U
+            for (int j = 0; j < numConstraints; j++)
+                solved[j] += factor / value * multipliers[j];
+        if (parts.velocity == No)
+            continue;
+        int first = 0, end = numParticles;
+        if (parts.norm == Largest) {
+            auto size = [&](int i) { return masses[i] > 0 ? v[i].dot(v[i]) + (*forces)[i].dot((*forces)[i]) : -1.0; };
+            for (int i = 1; i < numParticles; i++)
+                if (size(i) > size(first))
+                    first = i;
+            end = first + 1;
         }
-        case AppliedForce:
-        case ForcePNorm:
-        case MaxForce:
-        case ForceGroupEnergy:
-            break;
-        }
+        for (int i = first; i < end; i++)
+            if (masses[i] > 0)
+                gradient[i] += v[i] * (factor / value * (parts.velocity == Mass ? masses[i] : 1.0));
     }
-    if (!needsMultipliers())
+    if (!anyOf(terms, [](const Parts& parts) { return parts.ofConstraints(); }))
         return;
-    if (mustSolve) {
-        solver.solveMatrix(toSolve);
-        for (int k = 0; k < numConstraints; k++)
-            solved[k] += toSolve[k];
-    }
     // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-    for (double& x : solved)
-        x *= 2;
+    solver.solveMatrix(toSolve);
+    for (int j = 0; j < numConstraints; j++)
+        solved[j] = 2 * (solved[j] + toSolve[j]);
     solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
 }

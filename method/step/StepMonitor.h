@@ -7,7 +7,6 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include <cmath>
-#include <initializer_list>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -40,95 +39,63 @@ public:
         double weight, power;
         double reference; // U_k,ref; 0 while it is not known
         double order = 8; // p of the p-norms, of no meaning to others
+        /** Whether it is the same but for its reference. */
+        bool isLike(const Term& other) const {
+            return kind == other.kind && weight == other.weight && power == other.power && order == other.order;
+        }
     };
-
-    /** What is at the multipliers Lambda of some velocities. */
-    struct Multipliers {
-        const std::vector<double>& multipliers; // Lambda(q,p)
-        const std::vector<double>& rightSide; // K Lambda = g''(v,v) + G M^-1 F
-        const std::vector<double>* rate; // the change of Lambda along a change of the velocities; or null
-    };
-    /** Sums over each range of constraints (ConstraintSolver::getNumRanges()), which are added in that order. */
+    /** Sums over each range of constraints (ConstraintSolver::getNumRanges()) for one set of multipliers, added in that order. */
     struct Sums {
         std::vector<double> forces,
-            forceRates; // of Lambda_k (K Lambda)_k, and of the rate of Lambda_k in place of Lambda_k
-        std::vector<double> multipliers,
-            multiplierRates; // of d_k^2 Lambda_k^2 and d_k^2 Lambda_k times its rate, in users' units
+            multipliers; // of Lambda_k (K Lambda)_k and (d_k Lambda_k)^2, d_k Lambda_k in users' units
     };
 
     explicit StepMonitor(ConstraintSolver& solver);
-    void setTerms(const std::vector<Term>& terms);
+    void setTerms(const std::vector<Term>& newTerms);
     const std::vector<Term>& getTerms() const {
         return terms;
     }
     void setReference(int index, double value) {
         terms[index].reference = value;
     }
-    bool isEmpty() const {
-        return terms.empty();
-    }
-    /** Whether any term needs the multipliers. */
-    bool needsMultipliers() const;
     /** Whether any of some terms is defined by the constraints alone, and so is zero without them. */
     static bool needConstraints(const std::vector<Term>& terms);
-    /** Throws a StepFailure if a value is not a finite number, or negative. */
-    void requireValid(const std::vector<double>& values) const;
-    /** Whether any term changes with the velocities at fixed positions. */
+    /** Whether any term changes with the velocities at fixed positions; and whether it does so other than through the multipliers. */
     bool dependsOnVelocities() const;
-    /** Whether any term does so other than through the multipliers. */
     bool usesVelocities() const;
 
-    /**
-     * Take over the forces at new positions, on which the following evaluations are based.
-     *
-     * @param forces         the applied force on each particle (kJ/mol/nm)
-     * @param groupEnergy    the energy of the monitor's force group (kJ/mol)
-     */
-    void setForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
-    /**
-     * The part of setForces() that concerns a block of particles (ConstraintSystem::getBlocks()), so that threads may share it; when
-     * all have been done, the rest is finishForces().
-     */
+    /** The part of setForces() that concerns a block of particles (ConstraintSystem::getBlocks()); threads may share the blocks. */
     void sumForces(const std::vector<OpenMM::Vec3>& forces, int block);
-    void finishForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
-    /** Whether the forces of the last setForces() were all finite. */
+    /**
+     * Take over the forces at new positions (kJ/mol/nm) and the energy of the monitor's force group there (kJ/mol), on which the
+     * following evaluations are based.
+     *
+     * @param areSummed    sumForces() has been called for all blocks already
+     */
+    void setForces(const std::vector<OpenMM::Vec3>& newForces, double energy, bool areSummed = false);
+    /** Whether these were all finite. */
     bool hasFiniteForces() const {
         return std::isfinite(forceSquared);
     }
-    /** The forces of the last setForces(). */
-    const std::vector<OpenMM::Vec3>& getForces() const {
-        return *forces;
-    }
-    /** The forces of the last setForces() now lie elsewhere. */
+    /** They now lie elsewhere. */
     void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
         forces = &newForces;
     }
     Sums makeSums() const;
     /** Make the sums of one range; threads may share the ranges. */
-    void sumRange(const Multipliers& at, int range, int first, int end, Sums& sums) const;
-    /** Make all of them. */
-    Sums sum(const Multipliers& at) const;
+    void sumRange(const std::vector<double>& multipliers, const std::vector<double>& rightSide, int range, int first,
+                  int end, Sums& sums) const;
+    Sums sum(const std::vector<double>& multipliers, const std::vector<double>& rightSide) const;
     /**
      * U_k at velocities v, for every term.
      *
-     * @param v              the velocities (nm/ps)
      * @param multipliers    Lambda(q,p) at these velocities
      * @param sums           those of these multipliers
-     * @param values         U_k
      */
     void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers, const Sums& sums,
                   std::vector<double>& values);
-    /**
-     * The derivative of u along a change of the velocities, at the state of the last evaluate().
-     *
-     * @param v               as in evaluate()
-     * @param at              the multipliers there, with their rate
-     * @param sums            those of them
-     * @param values          what evaluate() gave
-     * @param velocityRate    the change of v
-     */
-    double evaluateRate(const std::vector<OpenMM::Vec3>& v, const Multipliers& at, const Sums& sums,
-                        const std::vector<double>& values, const std::vector<OpenMM::Vec3>& velocityRate) const;
+    /** Throws a StepFailure if a value is not a finite number, or negative. */
+    void requireValid(const std::vector<double>& values) const;
     /**
      * Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls, or of forces that cancel
      * each other.
@@ -141,34 +108,27 @@ public:
     /** u, the combination of the values; 1 if there is no term. A term without a reference counts as if it had its value there. */
     double combine(const std::vector<double>& values) const;
     /**
-     * du/dv at the state of the last evaluate(), at the positions of the solver.
+     * du/dv at the state of the last evaluate(), at the positions of the solver, the chain rule through Lambda (Lemma 4.2) included.
      *
      * @param theta          the parameters of the expressions
-     * @param v              as in evaluate()
-     * @param multipliers    as in evaluate()
      * @param values         what evaluate() gave
-     * @param[out] gradient  du/dv for each particle; the chain rule through Lambda included (Lemma 4.2)
      */
     void evaluateGradient(const ExpressionParameters& theta, const std::vector<OpenMM::Vec3>& v,
                           const std::vector<double>& multipliers, const std::vector<double>& values,
                           std::vector<OpenMM::Vec3>& gradient);
 
 private:
-    bool isWanted(std::initializer_list<Kind> kinds) const;
     template <class Size> double pNorm(int count, double order, const Size& size) const;
-    double squareOf(const OpenMM::Vec3& force, int particle) const;
-    bool areForcesNegligible(double acceleration) const;
-    double evaluateTerm(size_t index, const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
-    int findFastest(const std::vector<OpenMM::Vec3>& v) const;
+    double squareOf(const OpenMM::Vec3& force, int particle) const;
+    double sumOfForces(Kind kind) const;
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     std::vector<Term> terms;
     const std::vector<OpenMM::Vec3>* forces;
-    double groupEnergy, appliedForceSquared, forceSquared, maxForce, constraintForceSquared, multipliersSquared;
-    std::vector<double> forcePNorms; // of the terms of that kind
-    // Of the blocks: the sums of the squares of the forces, the same over masses, and the largest square.
-    std::vector<double> blockSums, blockAppliedSums, blockLargest;
+    double groupEnergy, forceSquared, appliedForceSquared, constraintForceSquared, multipliersSquared;
+    std::vector<double> forceNorms; // of the terms that are a norm of the forces other than the square one
+    std::vector<double> blockSums, blockAppliedSums; // of |F|^2 and |F|^2/m over each block
     std::vector<double> toSolve, solved;
 };
 

@@ -12,7 +12,7 @@ using std::vector;
 
 namespace {
 
-const int MAX_COUPLED_PASSES = 12, MAX_NEWTON_ITERATIONS = 50;
+const int MAX_COUPLED_PASSES = 12, MAX_NEWTON_ITERATIONS = 50, MAX_CUTS = 8;
 // If an iteration leaves more than this fraction of the error, something else is tried, or it is rounding.
 const double SLOW_CONVERGENCE = 0.25, SLOW_COUPLED_CONVERGENCE = 0.5;
 // The iteration of a regular step goes on to this fraction of the tolerance, that of a step from the on-step state, whose
@@ -137,8 +137,8 @@ void StepSolver::OffsetObserver::seeConstraints(int range, int first, int end) {
     other->seeConstraints(range, first, end);
 }
 
-bool StepSolver::solve(DensityEquation& equation, double& rhoNext) {
-    return solveByChord(equation, rhoNext) || solveByNewton(equation, rhoNext);
+bool StepSolver::solve(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
+    return solveByChord(equation, given, rhoNext) || solveByNewton(equation, given, rhoNext);
 }
 
 /*
@@ -146,9 +146,9 @@ bool StepSolver::solve(DensityEquation& equation, double& rhoNext) {
  * derivative is 1 + (h/(2 rho+^2)) du/dp (F - G^T Lambda) along the constraints; what either update does to the other's equation is
  * of higher order in h and left to the next pass.
  */
-bool StepSolver::solveByChord(DensityEquation& equation, double& rhoNext) {
-    const double rho = equation.rho;
-    rhoNext = equation.explicitValue + equation.offset;
+bool StepSolver::solveByChord(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
+    const double rho = given.rho;
+    rhoNext = given.explicitValue + given.offset;
     if (!(rhoNext > 0))
         return false;
     double previous = std::numeric_limits<double>::infinity();
@@ -156,11 +156,11 @@ bool StepSolver::solveByChord(DensityEquation& equation, double& rhoNext) {
     for (int pass = 0; pass <= MAX_COUPLED_PASSES; pass++) {
         const ConstraintSolver::Trial trial = trialTo(0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext, now.w);
         const ConstraintSolver::Guess start = regularGuess();
-        const double constraintError =
-            constraints.coupledPass(trial, {parametersAtRateOf(trial.drift), multiplierTrial, rightSideTrial},
-                                    pass == 0 ? &start : nullptr, equation.observe(multiplierTrial, rightSideTrial));
+        const double constraintError = constraints.coupledPass(
+            trial, {parametersAtRateOf(trial.drift), multiplierTrial, rightSideTrial}, pass == 0 ? &start : nullptr,
+            equation.observeTrial(multiplierTrial, rightSideTrial));
         const double uPlus = equation.evaluate(next.w, multiplierTrial);
-        const double mismatch = rhoNext - uPlus + equation.scale * (rho - equation.halfStepValue);
+        const double mismatch = rhoNext - uPlus + given.known;
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
         if (pass > 0 && error <= 1)
@@ -168,7 +168,7 @@ bool StepSolver::solveByChord(DensityEquation& equation, double& rhoNext) {
         if (!std::isfinite(error) || error > SLOW_COUPLED_CONVERGENCE * previous)
             return false;
         previous = error;
-        rhoNext -= mismatch / (1 + 0.5 * h * equation.rate / (rhoNext * rhoNext));
+        rhoNext -= mismatch / (1 + 0.5 * h * given.rate / (rhoNext * rhoNext));
         if (!(rhoNext > 0))
             return false;
     }
@@ -176,9 +176,9 @@ bool StepSolver::solveByChord(DensityEquation& equation, double& rhoNext) {
 }
 
 // Newton's iteration on (lambda, rho+) by the Schur complement (docs/method.md, section 8), for all constraints.
-bool StepSolver::solveByNewton(DensityEquation& equation, double& rhoNext) {
-    const double rho = equation.rho, uMinus = equation.scale * equation.halfStepValue;
-    rhoNext = equation.explicitValue > 0 ? equation.explicitValue : equation.fallBack;
+bool StepSolver::solveByNewton(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
+    const double rho = given.rho;
+    rhoNext = given.explicitValue > 0 ? given.explicitValue : given.fallBack;
     int numCuts = 0;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
@@ -188,11 +188,11 @@ bool StepSolver::solveByNewton(DensityEquation& equation, double& rhoNext) {
             constraints.guess(trial, regularGuess());
         const double constraintError = constraints.evaluate(trial);
         constraints.findMultipliers(next.w, parametersAtRateOf(drift), multiplierTrial, rightSideTrial);
-        ConstraintSolver::Observer* observer = equation.observe(multiplierTrial, rightSideTrial);
+        ConstraintSolver::Observer* observer = equation.observeTrial(multiplierTrial, rightSideTrial);
         constraints.forRanges([&](int range, int first, int end) { observer->seeConstraints(range, first, end); });
         const double uPlus = equation.evaluate(next.w, multiplierTrial);
         // F_rho of docs/method.md, section 8
-        const double mismatch = rhoNext - uPlus + equation.scale * rho - uMinus;
+        const double mismatch = rhoNext - uPlus + given.known;
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       relativeMismatch / std::max(REGULAR_MARGIN * tolerance, DENSITY_ROUNDING));
@@ -222,10 +222,11 @@ bool StepSolver::solveByNewton(DensityEquation& equation, double& rhoNext) {
         double change = (-mismatch - dot(coupling, correction)) / (d - dot(coupling, response));
         if (!std::isfinite(change))
             return false;
-        if (!(rhoNext + change > 0)) {
-            if (++numCuts > 8)
+        // Within a factor of 4 at a time: far away (3.14) has solutions of no meaning.
+        if (!(rhoNext + change > 0) || change > 3 * rhoNext) {
+            if (++numCuts > MAX_CUTS)
                 return false;
-            change = -0.75 * rhoNext;
+            change = change > 0 ? 3 * rhoNext : -0.75 * rhoNext;
         }
         rhoNext += change;
         for (size_t k = 0; k < lambdaNext.size(); k++)

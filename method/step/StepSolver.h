@@ -15,16 +15,18 @@ namespace OpenMMVRattle {
 /** The density equation rho+ + rho = u(q,p+) + u(q,p-) (3.14), as its solver needs it. */
 class DensityEquation {
 public:
+    /** What does not change in a step. */
+    struct Given {
+        double rho, known;            // rho[n-1/2]; rho - u(q,p-)
+        double explicitValue, offset; // the rho+ of (3.15), and what it lacked in the last step
+        double rate;                  // of u along F - G^T Lambda
+        double fallBack;              // a rho+ to begin with where that of (3.15) is not positive
+    };
     virtual ~DensityEquation() {
     }
-    double rho, scale; // rho[n-1/2], and what it and u(q,p-) are multiplied by; see MonitorControl
-    double explicitValue, offset; // the rho+ of (3.15), and what it lacked in the last step
-    double halfStepValue;         // u(q,p-)
-    double rate;                  // of u along F - G^T Lambda
-    double fallBack;              // a rho+ to begin with where that of (3.15) is not positive
     /** What is to see Lambda(q,p+) and K times it when they are known. */
-    virtual ConstraintSolver::Observer* observe(const std::vector<double>& multipliers,
-                                                const std::vector<double>& rightSide) = 0;
+    virtual ConstraintSolver::Observer* observeTrial(const std::vector<double>& multipliers,
+                                                     const std::vector<double>& rightSide) = 0;
     /** u(q,p+) at velocities w+, with Lambda(q,p+) that has been seen. */
     virtual double evaluate(const std::vector<OpenMM::Vec3>& w, const std::vector<double>& multipliers) = 0;
     /** du/dw there. */
@@ -63,7 +65,7 @@ public:
     /** The same backwards, from parameters that move at the same rates. */
     bool solveBackwards(double size, StepState& back);
     /** Solve (3.9)-(3.11) and (3.14) together, by chord iterations and where these fail by Newton's; rhoNext is found too. */
-    bool solve(DensityEquation& equation, double& rhoNext);
+    bool solve(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext);
     /** Say why the last of these failed. */
     std::string explainFailure();
 
@@ -95,8 +97,8 @@ private:
     };
     ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
     ConstraintSolver::Guess regularGuess() const;
-    bool solveByChord(DensityEquation& equation, double& rhoNext);
-    bool solveByNewton(DensityEquation& equation, double& rhoNext);
+    bool solveByChord(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext);
+    bool solveByNewton(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext);
     ConstraintSolver& constraints;
     const StepState& now;
     double h, tolerance;

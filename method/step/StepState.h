@@ -36,8 +36,16 @@ struct StepSettings {
     int calibrationSteps = 1; // how many steps the references are found from
 };
 
+/** What the paper's control keeps between two steps beside the density. */
+struct MonitorMemory {
+    bool hasHalfStepValue = false;
+    double u = 1, halfStepValue = 0; // u(q[n],p[n]), u(q[n],p[n-1/2])
+    double rate = 0; // the change of u along F - G^T Lambda; only the speed of convergence depends on it
+    double densityOffset = 0; // what (3.14) and (3.15) differed by in the last step
+};
+
 /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
-struct StepMemory {
+struct StepMemory : MonitorMemory {
     bool hasDensity;
     double density; // rho[n-1/2]
     std::vector<OpenMM::Vec3> halfStepVelocities; // M^-1 p[n-1/2]
@@ -47,10 +55,6 @@ struct StepMemory {
     std::vector<double> references; // U_k,ref in force
     // What could be computed again but for the last bits, which decide whether a restart is exact:
     std::vector<double> multipliers, monitorValues; // Lambda and U_k at (q[n],p[n])
-    bool hasHalfStepValue;
-    double u, halfStepValue; // u(q[n],p[n]), u(q[n],p[n-1/2])
-    double rate; // the change of u along F - G^T Lambda
-    double densityOffset; // what (3.14) and (3.15) differed by in the last step
     AutomaticControl::Memory automatic; // of automatic step control
 };
 

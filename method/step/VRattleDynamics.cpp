@@ -15,6 +15,8 @@ namespace {
 const double SLIVER = 1e-6;
 // A relative change of the velocities that starts no oscillation to speak of.
 const double SMALL_JUMP = 0.01;
+// Keeps what is at rest from being divided by zero.
+const double TINY = 1e-100;
 
 } // namespace
 
@@ -25,14 +27,9 @@ VRattleDynamics::VRattleDynamics(const vector<double>& masses, const vector<Dist
     now.theta = getConstraintSystem().getGivenParameters();
     target = now.theta.values;
     now.w.resize(getConstraintSystem().getNumParticles());
-    for (vector<double>* numbers :
-         {&now.lambda, &now.rightSide, &atHalfStep.multipliers, &atHalfStep.rightSide, &atHalfStep.rate})
+    for (vector<double>* numbers : {&now.lambda, &now.rightSide, &atHalfStep.multipliers, &atHalfStep.rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     constraints.moveTo(now.q, now.theta, now.force);
-}
-
-void VRattleDynamics::setParallel(const Parallel& newParallel, int numThreads) {
-    constraints.setParallel(newParallel, numThreads);
 }
 
 StepControl& VRattleDynamics::controlOf(const Settings& which) {
@@ -42,7 +39,6 @@ StepControl& VRattleDynamics::controlOf(const Settings& which) {
 }
 
 void VRattleDynamics::setSettings(const Settings& newSettings) {
-    MonitorControl::requireConstraintsFor(newSettings.terms, getConstraintSystem());
     StepControl& next = controlOf(newSettings);
     const bool goesOn = next.setSettings(newSettings, control == &next);
     control = &next;
@@ -66,20 +62,26 @@ void VRattleDynamics::adoptParameters() {
     constraints.moveTo(now.q, now.theta, now.force);
 }
 
-void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
-                            double energy) {
+template <class Change> void VRattleDynamics::attempt(const Change& change) {
     const Kept before = keep();
     try {
-        target = now.theta.values;
-        std::fill(now.theta.rates.begin(), now.theta.rates.end(), 0.0);
-        now.theta.isMoving = false;
-        takeOver(positions, velocities, forces, energy);
-        control->begin();
+        change();
     }
     catch (...) {
         putBack(before);
         throw;
     }
+}
+
+void VRattleDynamics::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                            double energy) {
+    attempt([&] {
+        target = now.theta.values;
+        std::fill(now.theta.rates.begin(), now.theta.rates.end(), 0.0);
+        now.theta.isMoving = false;
+        takeOver(positions, velocities, forces, energy);
+        control->begin();
+    });
 }
 
 // An on-step state that no step has led to, from somebody else.
@@ -122,20 +124,16 @@ VRattleDynamics::Memory VRattleDynamics::getMemory() const {
 }
 
 VRattleDynamics::Kept VRattleDynamics::keep() const {
-    return {settings, now.q, now.v, now.force, now.groupEnergy, target, getMemory(), now.rightSide};
+    return {settings, now, target, getMemory()};
 }
 
 void VRattleDynamics::putBack(const Kept& kept) {
     settings = kept.settings;
     control = &controlOf(settings);
     solver.setSettings(settings.stepSize, settings.tolerance);
-    now.q = kept.positions;
-    now.v = kept.velocities;
-    now.force = kept.forces;
-    now.groupEnergy = kept.groupEnergy;
     target = kept.target;
-    now.rightSide = kept.rightSide;
     setMemory(kept.memory);
+    now = kept.state;
     constraints.moveTo(now.q, now.theta, now.force);
 }
 
@@ -152,31 +150,21 @@ void VRattleDynamics::setMemory(const Memory& memory) {
 
 void VRattleDynamics::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                              double energy, const Memory& memory) {
-    const Kept before = keep();
-    try {
+    attempt([&] {
         setMemory(memory); // with the parameters
         takeOver(positions, velocities, forces, energy);
         control->begin();
-    }
-    catch (...) {
-        putBack(before);
-        throw;
-    }
+    });
     now.v = velocities; // this has projected them, which changes the last bits
     setMemory(memory);
 }
 
 void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities,
                                   const vector<Vec3>& forces, double energy) {
-    const Kept before = keep();
-    try {
+    attempt([&] {
         takeOver(positions, velocities, forces, energy);
         control->change(StepControl::Everything, 1.0);
-    }
-    catch (...) {
-        putBack(before);
-        throw;
-    }
+    });
     if (control->hasStarted())
         formHalfStepVelocities();
 }
@@ -197,46 +185,46 @@ bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
     return true;
 }
 
+// In a metric of masses, over the particles that move.
+double VRattleDynamics::squareOf(const vector<Vec3>& x, const vector<double>& weights) {
+    const vector<int>& particles = constraints.getMovingParticles();
+    return constraints.sum((int) particles.size(), [&](int p) {
+        const int i = particles[p];
+        return weights[i] * x[i].dot(x[i]);
+    });
+}
+
 void VRattleDynamics::changeVelocities(const vector<Vec3>& velocities) {
     const vector<double>& masses = getConstraintSystem().getMasses();
     vector<Vec3>& change = solver.next.v;
     for (int i : constraints.getMovingParticles())
         change[i] = velocities[i] - now.v[i];
     constraints.projectVelocities(change);
-    double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
     for (int i : constraints.getMovingParticles()) {
-        changeSquared += masses[i] * change[i].dot(change[i]);
         now.v[i] += change[i];
-        speedSquared += masses[i] * now.v[i].dot(now.v[i]);
         now.w[i] += change[i];
     }
     constraints.findMultipliers(now.v, now.theta, now.lambda, now.rightSide);
-    control->change(StepControl::Velocities, std::min(1.0, std::sqrt(changeSquared / speedSquared)));
+    const double part = squareOf(change, masses) / (squareOf(now.v, masses) + TINY);
+    control->change(StepControl::Velocities, std::min(1.0, std::sqrt(part)));
 }
 
-void VRattleDynamics::changeForces(vector<Vec3>& forces, double energy) {
+void VRattleDynamics::changeForces(const vector<Vec3>& forces, double energy) {
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
-    double changeSquared = 0, forceSquared = 1e-100; // in the mass metric
-    for (int i : constraints.getMovingParticles()) {
-        const Vec3 change = forces[i] - now.force[i];
-        changeSquared += inverseMasses[i] * change.dot(change);
-        forceSquared += inverseMasses[i] * std::max(forces[i].dot(forces[i]), now.force[i].dot(now.force[i]));
-    }
+    vector<Vec3>& change = solver.next.v;
+    for (int i : constraints.getMovingParticles())
+        change[i] = forces[i] - now.force[i];
+    const double changeSquared = squareOf(change, inverseMasses);
+    const double forceSquared = std::max(squareOf(forces, inverseMasses), squareOf(now.force, inverseMasses));
     if (!std::isfinite(changeSquared))
         throw StepFailure("the force on a particle is infinite or not a number");
-    const Kept before = keep();
-    try {
-        now.force.swap(forces);
+    attempt([&] {
+        now.force = forces;
         now.groupEnergy = energy;
         constraints.moveTo(now.q, now.theta, now.force);
         constraints.findMultipliers(now.v, now.theta, now.lambda, now.rightSide);
-        control->change(StepControl::Forces, std::min(1.0, std::sqrt(changeSquared / forceSquared)));
-    }
-    catch (...) {
-        forces.swap(now.force);
-        putBack(before);
-        throw;
-    }
+        control->change(StepControl::Forces, std::min(1.0, std::sqrt(changeSquared / (forceSquared + TINY))));
+    });
     if (control->hasStarted())
         formHalfStepVelocities();
 }
@@ -305,15 +293,13 @@ void VRattleDynamics::findJump() {
         return;
     const vector<double>& masses = getConstraintSystem().getMasses();
     vector<Vec3>& velocities = solver.next.v;
-    double changeSquared = 0, speedSquared = 1e-100; // in the mass metric
     for (int i : constraints.getMovingParticles())
         velocities[i] = Vec3();
     constraints.addProjection(now.v, theta, velocities);
-    for (int i : constraints.getMovingParticles()) {
-        changeSquared += masses[i] * velocities[i].dot(velocities[i]);
+    const double changeSquared = squareOf(velocities, masses);
+    for (int i : constraints.getMovingParticles())
         velocities[i] += now.v[i];
-        speedSquared += masses[i] * std::max(velocities[i].dot(velocities[i]), now.v[i].dot(now.v[i]));
-    }
+    const double speedSquared = std::max(squareOf(velocities, masses), squareOf(now.v, masses)) + TINY;
     control->jump(velocities, theta, changeSquared > SMALL_JUMP * SMALL_JUMP * speedSquared);
 }
 

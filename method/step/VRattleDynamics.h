@@ -40,7 +40,9 @@ public:
                     const std::vector<ExpressionConstraint>& expressions = {});
 
     /** Let threads share the work where that is faster. Results do not depend on their number, to the last bit. */
-    void setParallel(const Parallel& parallel, int numThreads);
+    void setParallel(const Parallel& parallel, int numThreads) {
+        constraints.setParallel(parallel, numThreads);
+    }
     /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
     template <class Task> void share(int count, const Task& task) {
         constraints.share(count, task);
@@ -49,8 +51,6 @@ public:
     /**
      * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
      * half-step momentum is formed anew.
-     *
-     * @throws StepFailure    if a monitor needs constraints and there are none
      */
     void setSettings(const Settings& settings);
 
@@ -73,11 +73,9 @@ public:
     /** All that a trial run or a start changes, to be put back. */
     struct Kept {
         Settings settings;
-        std::vector<OpenMM::Vec3> positions, velocities, forces;
-        double groupEnergy;
+        StepState state;
         std::vector<double> target;
         Memory memory;
-        std::vector<double> rightSide;
     };
     Kept keep() const;
     /** Put back what was kept, to the last bit. */
@@ -143,10 +141,9 @@ public:
     /**
      * Go on with other forces at the same positions and velocities, since a parameter of a force has changed; as changeState().
      *
-     * @param[in,out] forces    the applied forces; their storage is taken over, and that of the forces before left in its place
      * @throws StepFailure    if they are not finite; then nothing has been changed
      */
-    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    void changeForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
     /**
      * The first half of a step.
@@ -226,7 +223,9 @@ public:
 private:
     void takeOver(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                   const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    template <class Change> void attempt(const Change& change);
     void setMemory(const Memory& memory);
+    double squareOf(const std::vector<OpenMM::Vec3>& x, const std::vector<double>& weights);
     StepControl& controlOf(const Settings& settings);
     void formHalfStepVelocities();
     void prepareStep();

@@ -49,22 +49,8 @@ public:
     }
     double u(const vector<Vec3>& v) {
         solver.findMultipliers(v, theta, multipliers, rightSide);
-        monitor.evaluate(v, multipliers, monitor.sum({multipliers, rightSide, nullptr}), values);
+        monitor.evaluate(v, multipliers, monitor.sum(multipliers, rightSide), values);
         return monitor.combine(values);
-    }
-    // du along a change of v, with the change of Lambda that goes with it: 2 K^-1 G(v) dv
-    double rate(const vector<Vec3>& v, const vector<Vec3>& change) {
-        u(v);
-        const ConstraintSystem& system = solver.getSystem();
-        vector<double> multiplierRate(multipliers.size());
-        ConstraintSystem::Jacobian velocityJacobian(system.getNumEntries());
-        system.evaluateVelocityJacobian(e.positions, v, theta, velocityJacobian);
-        system.multiply(velocityJacobian, change, multiplierRate);
-        for (double& x : multiplierRate)
-            x *= 2;
-        solver.solveMatrix(multiplierRate);
-        const StepMonitor::Multipliers at = {multipliers, rightSide, &multiplierRate};
-        return monitor.evaluateRate(v, at, monitor.sum(at), values, change);
     }
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
@@ -98,11 +84,6 @@ static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
             double difference = (evaluation.u(plus) - evaluation.u(minus)) / (2 * h);
             ASSERT(std::fabs(difference - gradient[i][j]) <= 1e-6 * largest);
         }
-    // The rate along a direction is the gradient times it.
-    double expected = 0;
-    for (size_t i = 0; i < gradient.size(); i++)
-        expected += gradient[i].dot(e.forces[i]);
-    ASSERT(std::fabs(evaluation.rate(e.velocities, e.forces) - expected) <= 1e-10 * (std::fabs(expected) + largest));
 }
 
 void testGradients() {
