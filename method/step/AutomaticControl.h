@@ -7,9 +7,28 @@
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
 #include "step/ClusterForces.h"
+#include "step/StepDensity.h"
+#include <algorithm>
+#include <cmath>
 #include <vector>
 
 namespace OpenMMVRattle {
+
+/** The recursions, which devices have too. */
+namespace AutomaticRecursions {
+typedef double wide;
+using std::max;
+using std::min;
+inline wide stretch(wide rho, wide a) {
+    return StepDensity::f(rho, a);
+}
+inline wide unstretch(wide y, wide a) {
+    return StepDensity::inverseOfF(y, a);
+}
+#define DEVICE
+#include "step/AutomaticRecursions.h"
+#undef DEVICE
+} // namespace AutomaticRecursions
 
 /**
  * Automatic step control: the density rho from two monitors that need no choice (docs/automatic_method.md has the reasons).
@@ -37,6 +56,8 @@ namespace OpenMMVRattle {
  */
 class AutomaticControl {
 public:
+    /** l and l_f (nm), and 6, the weight of the change of the forces. */
+    static constexpr double LENGTH = 0.0125, FLIGHT = 0.4, CHANGE_WEIGHT = 6;
     /** The two monitors, in the order of everything that has two of something here. */
     enum Monitor { OnStep, HalfStep };
     static constexpr int NUM_MONITORS = 2;
@@ -49,22 +70,20 @@ public:
     };
 
     /** What the following steps depend on, beside the references. */
-    struct Memory {
-        double behind[NUM_MONITORS], ahead[NUM_MONITORS]; // f(A), f(B) on the half steps n-1/2 and n+1/2
-        double values[NUM_MONITORS];                      // U_A[n] and U_B[n-1/2], the latter 0 before the first step
-        std::vector<double> forceSquares;                 // S_c[n]
-        double stepsSinceStart;                           // of this sequence, as far as they count
-        double numLearnt, logarithms[NUM_MONITORS]; // steps that have been learnt from, and the mean of ln U over them
-        double temperature; // 2K/f (kJ/mol) where the references were found
-        double following; // for how many steps the references follow the run
-        double shortSteps,
-            mostShortSteps; // steps in a row below a tenth of the nominal one: now, and the most there were
+    struct Memory : AutomaticRecursions::AutomaticNumbers {
+        std::vector<double> forceSquares; // S_c[n]
     };
 
     explicit AutomaticControl(ConstraintSolver& solver);
 
-    void setSettings(const Settings& newSettings) {
-        settings = newSettings;
+    void setSettings(const Settings& newSettings);
+    /** The settings and what follows from the System, as the recursions have them. */
+    const AutomaticRecursions::AutomaticChoice& getChoice() const {
+        return choice;
+    }
+    /** 3 n - m, by which twice the kinetic energy is divided. */
+    double getNumDegreesOfFreedom() const {
+        return numDegreesOfFreedom;
     }
     /** The reference value of a monitor, 0 while it is not known. */
     double getReference(int monitor) const {
@@ -126,39 +145,27 @@ public:
 
     /** rho[n-1/2]. */
     double getLast() const {
-        return combine(memory.behind);
+        return AutomaticRecursions::automaticDensity(&choice, memory.behind);
     }
     /** rho[n+1/2]. */
     double getNext() const {
-        return combine(memory.ahead);
+        return AutomaticRecursions::automaticDensity(&choice, memory.ahead);
     }
     /** Where all monitors are no more than this, there is nothing to learn from. */
-    double getNegligibleValue() const;
+    double getNegligibleValue() const {
+        return AutomaticRecursions::automaticNegligibleValue(&choice);
+    }
 
 private:
-    double target(int monitor, double value) const;
-    double combine(const double (&transformed)[NUM_MONITORS]) const;
-    double limit(double density) const;
     void findSquares(const State& state, std::vector<double>& squares);
     double evaluateOnStep(const State& state, const std::vector<double>& squares);
-    double thermalValue(double temperature) const;
-    bool isKnown(int monitor) const {
-        return references[monitor] > 0;
-    }
-    void draw(double part);
-    void adapt(double part);
-    void setFound(double onStep, double halfStep);
-    bool findHard();
-    void learn();
-    void follow(double part);
-    void raiseReferences();
 
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     ClusterForces clusterForces;
     int numClusters;
     double numDegreesOfFreedom;
-    Settings settings;
+    AutomaticRecursions::AutomaticChoice choice;
     double references[NUM_MONITORS];
     Memory memory;
     double temperature; // 2K/f of the state that was looked at last

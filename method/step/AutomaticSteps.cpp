@@ -101,6 +101,17 @@ void AutomaticSteps::begin() {
     takeValues();
 }
 
+void AutomaticSteps::adopt(double density, const AutomaticRecursions::AutomaticNumbers& numbers,
+                           const vector<double>& references) {
+    AutomaticControl::Memory memory = control.getMemory(); // with S_c
+    static_cast<AutomaticRecursions::AutomaticNumbers&>(memory) = numbers;
+    control.setMemory(memory);
+    setReferences(references);
+    takeValues();
+    hasDensity = true;
+    rho = density;
+}
+
 void AutomaticSteps::change(ChangeKind kind, double part) {
     const bool isPlace = kind == Everything || kind == Forces;
     if (isPlace && !hasDensity) {

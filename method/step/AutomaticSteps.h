@@ -25,6 +25,9 @@ public:
     void getMemory(StepMemory& memory) const override;
     void setMemory(const StepSettings& settings, const StepMemory& memory) override;
     void begin() override;
+    /** Go on after begin() with the numbers and references of somebody else's steps, which have led here. */
+    void adopt(double density, const AutomaticRecursions::AutomaticNumbers& numbers,
+               const std::vector<double>& references);
     void change(ChangeKind kind, double part) override;
     void reverse() override;
     void prepare() override;

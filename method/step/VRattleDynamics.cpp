@@ -112,6 +112,15 @@ void VRattleDynamics::adopt(const vector<Vec3>& positions, const vector<Vec3>& v
     monitors.adopt(density, halfStepValue, offset);
 }
 
+void VRattleDynamics::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                            double energy, double density, const AutomaticRecursions::AutomaticNumbers& numbers,
+                            const vector<double>& references) {
+    begin(positions, velocities, forces, energy);
+    now.v = velocities; // which have been projected, and so changed in the last bits
+    automatic.adopt(density, numbers, references);
+    formHalfStepVelocities();
+}
+
 VRattleDynamics::Memory VRattleDynamics::getMemory() const {
     Memory memory = {};
     memory.halfStepVelocities = now.w;

@@ -117,6 +117,15 @@ public:
     void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double density, const double* halfStepValue,
                double offset);
+    /** Take over the numbers and references of automatic step control that somebody else has carried on; the state is another. */
+    void adopt(double density, const AutomaticRecursions::AutomaticNumbers& numbers,
+               const std::vector<double>& references) {
+        automatic.adopt(density, numbers, references);
+    }
+    /** All of that. */
+    void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double density,
+               const AutomaticRecursions::AutomaticNumbers& numbers, const std::vector<double>& references);
     /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
     double findHalfStepValue() {
         return monitors.findHalfStepValue();

@@ -258,6 +258,8 @@ template <class Host> bool CommonRunDevice<Host>::updateState() {
     // What changes positions must not find those of a step that has failed.
     if (reach.hasBarostat)
         settle();
+    if (reach.hasThermostat && isOnDevice)
+        steps->keepVelocities();
     try {
         return Host::updateState();
     }
@@ -304,6 +306,8 @@ template <class Host> unsigned long long CommonRunDevice<Host>::getFingerprint()
 
 template <class Host> void CommonRunDevice<Host>::start() {
     settle();
+    if (!isOnHost)
+        carryOn(state);
     isOnDevice = false;
     isOnHost = true;
     hasForces = false;
@@ -321,7 +325,7 @@ template <class Host> void CommonRunDevice<Host>::changeState() {
         return;
     }
     computeForces();
-    hasBegun = steps->change(groupEnergy);
+    hasBegun = steps->change(groupEnergy, Control::AllChanged);
     knownCount = vectors->getStepCount();
     readState();
 }
@@ -335,7 +339,7 @@ template <class Host> void CommonRunDevice<Host>::changeForces() {
         return;
     }
     computeForces();
-    hasBegun = steps->change(groupEnergy);
+    hasBegun = steps->change(groupEnergy, Control::ForcesChanged);
     knownCount = vectors->getStepCount();
     readState();
 }
@@ -348,7 +352,7 @@ template <class Host> void CommonRunDevice<Host>::changeVelocities() {
         return;
     }
     ensureForces();
-    hasBegun = steps->change(groupEnergy);
+    hasBegun = steps->change(groupEnergy, Control::VelocitiesChanged);
     readState();
 }
 
@@ -417,6 +421,11 @@ template <class Host> long long CommonRunDevice<Host>::getNumSolverIterations() 
 template <class Host> long long CommonRunDevice<Host>::getNumDeviceRescues() {
     settle();
     return numDeviceRescues;
+}
+
+template <class Host> const DeviceSteps::State* CommonRunDevice<Host>::findDeviceState() {
+    settle();
+    return isOnHost ? nullptr : &state;
 }
 
 template <class Host> void CommonRunDevice<Host>::save(RunState& run) {

@@ -70,10 +70,15 @@ protected:
     virtual DeviceSteps::State makeDeviceState() = 0;
     /** Let the host go on with the state of the GPU. */
     virtual void adopt(const typename Host::State& state, const DeviceSteps::State& others) = 0;
+    /** Let the host know what a start depends on, though the state that it starts from is another. */
+    virtual void carryOn(const DeviceSteps::State&) {
+    }
     /** Whether it matters that all velocities have changed by the same. */
     virtual bool doesFrameMatter() = 0;
     /** The monitors on the GPU, if it is there that the state is. */
     bool readMonitorValues(std::vector<double>& values);
+    /** What the GPU has beside the monitors, if it is there that the state is; else null. */
+    const DeviceSteps::State* findDeviceState();
     void bringToHost();
     void takeToHost();
     long long getNumDeviceRescues();

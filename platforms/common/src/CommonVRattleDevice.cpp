@@ -8,6 +8,14 @@
 using namespace OpenMMVRattle;
 using std::vector;
 
+namespace {
+
+vector<double> referencesOf(const DeviceSteps::State& state) {
+    return {std::begin(state.references), std::end(state.references)};
+}
+
+} // namespace
+
 CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                          const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         CommonRunDevice(context, compute, integrator, settings) {
@@ -15,34 +23,68 @@ CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::C
 
 bool CommonVRattleDevice::canGoOnDevice() {
     const vector<double> references = vrattle.getReferences();
-    return !settings.isAutomatic && vrattle.hasStarted() &&
-           std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; });
+    // Automatic step control finds its references on the way.
+    return vrattle.hasStarted() &&
+           (settings.isAutomatic ||
+            std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
-    vector<StepMonitor::Term> terms = settings.terms;
-    const vector<double> references = vrattle.getReferences();
-    for (size_t k = 0; k < terms.size(); k++)
-        terms[k].reference = references[k];
-    return {
+    DeviceSteps::Settings to = {
         settings.stepSize,  StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
         settings.update,    settings.isFixedStep,
-        settings.tolerance, terms};
+        settings.tolerance, {}};
+    to.isAutomatic = settings.isAutomatic;
+    if (settings.isAutomatic) {
+        to.choice = vrattle.getAutomaticControl().getChoice();
+        to.numDegreesOfFreedom = vrattle.getAutomaticControl().getNumDegreesOfFreedom();
+        return to;
+    }
+    to.terms = settings.terms;
+    const vector<double> references = vrattle.getReferences();
+    for (size_t k = 0; k < to.terms.size(); k++)
+        to.terms[k].reference = references[k];
+    return to;
 }
 
 DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
-    const double halfStepValue = vrattle.findHalfStepValue();
+    const double halfStepValue = settings.isAutomatic ? 0.0 : vrattle.findHalfStepValue();
     const VRattleDynamics::Memory memory = vrattle.getMemory();
-    return {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
+    DeviceSteps::State state = {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
+    if (settings.isAutomatic) {
+        state.automatic = memory.automatic;
+        std::copy(memory.references.begin(), memory.references.end(), state.references);
+    }
+    return state;
 }
 
 void CommonVRattleDevice::adopt(const State& state, const DeviceSteps::State& others) {
-    vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.density,
-                  others.hasHalfStepValue ? &others.halfStepValue : nullptr, others.densityOffset);
+    if (settings.isAutomatic)
+        vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.density,
+                      others.automatic, referencesOf(others));
+    else
+        vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.density,
+                      others.hasHalfStepValue ? &others.halfStepValue : nullptr, others.densityOffset);
 }
 
+void CommonVRattleDevice::carryOn(const DeviceSteps::State& others) {
+    if (settings.isAutomatic)
+        vrattle.adopt(others.density, others.automatic, referencesOf(others));
+}
+
+// What a CMMotionRemover takes away is nothing to speak of for automatic step control, which would have to look at all velocities again.
 bool CommonVRattleDevice::doesFrameMatter() {
-    return StepProgram::usesSpeeds(settings.terms);
+    return !settings.isAutomatic && StepProgram::usesSpeeds(settings.terms);
+}
+
+vector<double> CommonVRattleDevice::getReferences() {
+    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
+    return others != nullptr ? referencesOf(*others) : HostVRattleDevice::getReferences();
+}
+
+long long CommonVRattleDevice::getNumShortSteps() {
+    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
+    return others != nullptr ? (long long) others->automatic.mostShortSteps : HostVRattleDevice::getNumShortSteps();
 }
 
 void CommonVRattleDevice::beginTrial(double stepSize, bool isBackwards) {

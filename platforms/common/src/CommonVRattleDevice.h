@@ -9,20 +9,23 @@
 
 namespace OpenMMVRattle {
 
-/** The device of VariableStepRattleIntegrator for OpenCL, CUDA and HIP. With automatic step control the host takes all steps. */
+/** The device of VariableStepRattleIntegrator for OpenCL, CUDA and HIP. */
 class CommonVRattleDevice : public CommonRunDevice<HostVRattleDevice> {
 public:
     CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                         const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
+    std::vector<double> getReferences() override;
     void beginTrial(double stepSize, bool isBackwards) override;
     std::vector<double> getMonitorValues() override;
     long long getNumRescues() override;
+    long long getNumShortSteps() override;
 
 protected:
     bool canGoOnDevice() override;
     DeviceSteps::Settings makeDeviceSettings() override;
     DeviceSteps::State makeDeviceState() override;
     void adopt(const State& state, const DeviceSteps::State& others) override;
+    void carryOn(const DeviceSteps::State& others) override;
     bool doesFrameMatter() override;
 };
 

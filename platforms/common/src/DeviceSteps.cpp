@@ -69,7 +69,8 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& cl
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
         isWide(context.getSupportsDoublePrecision()), groupSize(StepProgram::getGroupSize(!large.isEmpty())),
         numGroups(0), numPartials(0), numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0),
-        numTrials(MOST_TRIALS), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0) {
+        numTrials(MOST_TRIALS), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0),
+        areVelocitiesKept(false) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
@@ -157,8 +158,9 @@ void DeviceSteps::initializeLarge() {
 void DeviceSteps::setSettings(const Settings& newSettings) {
     OpenMM::ContextSelector selector(context);
     settings = newSettings;
-    compile(StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
-    vector<double> numbers(Control::FirstTerm + 3 * settings.terms.size());
+    compile(settings.isAutomatic ? StepProgram::Automatic
+                                 : StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
+    vector<double> numbers(program->getNumSettings());
     numbers[Control::Nominal] = settings.stepSize;
     numbers[Control::Smallest] = settings.density.getSmallest();
     numbers[Control::Lower] = settings.density.getLower();
@@ -171,6 +173,11 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
         numbers[Control::FirstTerm + 3 * k] = settings.terms[k].weight;
         numbers[Control::FirstTerm + 3 * k + 1] = settings.terms[k].power;
         numbers[Control::FirstTerm + 3 * k + 2] = settings.terms[k].reference;
+    }
+    if (settings.isAutomatic) {
+        const double* choice = reinterpret_cast<const double*>(&settings.choice);
+        std::copy(choice, choice + Control::NumAutomaticChoices, &numbers[Control::FirstTerm]);
+        numbers.back() = 1 / settings.numDegreesOfFreedom;
     }
     settingsArray.upload(numbers, true);
 }
@@ -189,10 +196,18 @@ void DeviceSteps::compile(StepProgram::Update update) {
         else if (array.getSize() != size)
             array.resize(size);
     };
-    resize(settingsArray, Control::FirstTerm + 3 * settings.terms.size(), wideSize, "vrattleSettings");
+    resize(settingsArray, program->getNumSettings(), wideSize, "vrattleSettings");
     for (OpenMM::ComputeArray& array : control)
-        resize(array, Control::FirstValue + settings.terms.size(), wideSize, "vrattleControl");
-    resize(reportArray, Control::FirstValue + settings.terms.size() + 2, wideSize, "vrattleReport");
+        resize(array, program->getControlSize(), wideSize, "vrattleControl");
+    resize(reportArray, program->getControlSize() + 2, wideSize, "vrattleReport");
+    if (update == StepProgram::Automatic && !lastForces.isInitialized()) {
+        const int numAtoms = context.getPaddedNumAtoms();
+        lastForces.initialize(context, 3 * numAtoms, 8, "vrattleLastForces");
+        lastSquares.initialize(context, numAtoms, mixedSize, "vrattleLastSquares");
+        lastVelocities.initialize(context, numAtoms, 4 * mixedSize, "vrattleLastVelocities");
+        context.clearBuffer(lastForces);
+        context.clearBuffer(lastSquares);
+    }
     resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numPartials, mixedSize, "vrattlePartials");
     for (OpenMM::ComputeArray& array : trialPartials)
         resize(array, numSums * numPartials, mixedSize, "vrattleTrialPartials");
@@ -247,6 +262,7 @@ void DeviceSteps::setArguments(Kernels& created) {
     created.finish->addArg(partials);
     created.finish->addArg(numPartials);
     addState(created.finish);
+    addLastState(created.finish);
 
     addEmpty(created.evaluate, 5); // step, isRescaled, groupEnergy, numPartials, control
     created.evaluate->addArg(settingsArray);
@@ -286,6 +302,15 @@ void DeviceSteps::addLargeTables(ComputeKernel& kernel) {
         kernel->addArg(*array);
 }
 
+void DeviceSteps::addLastState(ComputeKernel& kernel) {
+    if (!settings.isAutomatic)
+        return;
+    kernel->addArg(lastForces);
+    kernel->addArg(lastSquares);
+    kernel->addArg(context.getAtomIndexArray());
+    kernel->addArg(lastVelocities);
+}
+
 // The same for kernels/large.cc.
 void DeviceSteps::setLargeArguments(Kernels& created) {
     OpenMM::ArrayInterface& corrections = correctionsOf(context);
@@ -306,6 +331,7 @@ void DeviceSteps::setLargeArguments(Kernels& created) {
     created.finishLarge->addArg(partials);
     created.finishLarge->addArg(numPartials);
     addState(created.finishLarge);
+    addLastState(created.finishLarge);
 
     if (created.tryLarge) {
         addEmpty(created.tryLarge, 6); // step, firstStage, endStage, isLast, stamp, tolerance
@@ -371,10 +397,10 @@ void DeviceSteps::launchLarge(ComputeKernel& kernel, int step, int numStages) {
     }
 }
 
-void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStored) {
+void DeviceSteps::launchFinish(int step, double kick, Control::Change change, bool isStored) {
     kernels.finish->setArg(0, step);
     setMixed(kernels.finish, 1, kick);
-    kernels.finish->setArg(2, (int) isFormed);
+    kernels.finish->setArg(2, (int) change);
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control[half]);
     launch(kernels.finish, 18);
@@ -382,16 +408,16 @@ void DeviceSteps::launchFinish(int step, double kick, bool isFormed, bool isStor
         return;
     const int numProjections = getNumProjections();
     setMixed(kernels.finishLarge, 5, kick);
-    kernels.finishLarge->setArg(6, (int) isFormed);
+    kernels.finishLarge->setArg(6, (int) change);
     kernels.finishLarge->setArg(7, (int) isStored);
     kernels.finishLarge->setArg(8, numProjections);
     kernels.finishLarge->setArg(9, control[half]);
     launchLarge(kernels.finishLarge, step, numProjections + (program->hasHalfSums() ? 3 : 2));
 }
 
-void DeviceSteps::launchEvaluate(int step, bool isRescaled) {
+void DeviceSteps::launchEvaluate(int step, Control::Change change) {
     kernels.evaluate->setArg(0, step);
-    kernels.evaluate->setArg(1, (int) isRescaled);
+    kernels.evaluate->setArg(1, (int) change);
     setWide(kernels.evaluate, 2, groupEnergy);
     kernels.evaluate->setArg(3, numPartials);
     kernels.evaluate->setArg(4, control[half]);
@@ -401,28 +427,45 @@ void DeviceSteps::launchEvaluate(int step, bool isRescaled) {
 
 bool DeviceSteps::begin(const State& state, double energy) {
     OpenMM::ContextSelector selector(context);
-    vector<double> block(Control::FirstValue + settings.terms.size(), 0.0);
+    vector<double> block(program->getControlSize(), 0.0);
     block[Control::Density] = state.density;
     block[Control::StepSize] = settings.stepSize / state.density;
     block[Control::DensityOffset] = state.densityOffset;
     block[Control::IsHalfKnown] = state.hasHalfStepValue;
     block[Control::HalfU] = state.halfStepValue;
     block[Control::MismatchSlope] = 1;
+    if (settings.isAutomatic) {
+        const double* numbers = reinterpret_cast<const double*>(&state.automatic);
+        std::copy(numbers, numbers + Control::NumAutomaticNumbers, &block[Control::FirstNumber]);
+        std::copy(std::begin(state.references), std::end(state.references), &block[Control::FirstReference]);
+        block[Control::IsAccepted] = 1;
+    }
     control[half].upload(block, true);
     numStepsRead = numRescuesRead = 0;
     elapsedRead = 0;
     groupEnergy = energy;
-    launchFinish(NO_STEP, 0, true, false);
-    launchEvaluate(NO_STEP, false);
+    launchFinish(NO_STEP, 0, Control::AllChanged, false);
+    launchEvaluate(NO_STEP, Control::NothingChanged);
     return !hasChangeFailed();
 }
 
-bool DeviceSteps::change(double energy) {
+void DeviceSteps::keepVelocities() {
+    if (!settings.isAutomatic)
+        return;
     OpenMM::ContextSelector selector(context);
-    launchEvaluate(NO_STEP, false); // u before the change
+    context.getVelm().copyTo(lastVelocities);
+    areVelocitiesKept = true;
+}
+
+bool DeviceSteps::change(double energy, Control::Change change) {
+    OpenMM::ContextSelector selector(context);
+    if (!areVelocitiesKept)
+        keepVelocities();
+    areVelocitiesKept = false;
+    launchEvaluate(NO_STEP, Control::NothingChanged); // u before the change
     groupEnergy = energy;
-    launchFinish(NO_STEP, 0, true, true);
-    launchEvaluate(NO_STEP, true);
+    launchFinish(NO_STEP, 0, change, true);
+    launchEvaluate(NO_STEP, change);
     return !hasChangeFailed();
 }
 
@@ -439,6 +482,7 @@ bool DeviceSteps::hasChangeFailed() {
 void DeviceSteps::advance(double maxStep) {
     OpenMM::ContextSelector selector(context);
     stepNumber++;
+    areVelocitiesKept = false;
     if (kernels.trial)
         for (int i = 0; i < numTrials; i++) {
             kernels.trial->setArg(0, stepNumber);
@@ -480,12 +524,12 @@ void DeviceSteps::advance(double maxStep) {
 void DeviceSteps::finish(double energy) {
     OpenMM::ContextSelector selector(context);
     groupEnergy = energy;
-    launchFinish(stepNumber, 0.5, false, true);
+    launchFinish(stepNumber, 0.5, Control::NothingChanged, true);
 }
 
 DeviceSteps::Report DeviceSteps::read() {
     OpenMM::ContextSelector selector(context);
-    launchEvaluate(stepNumber, false);
+    launchEvaluate(stepNumber, Control::NothingChanged);
     vector<double> block;
     reportArray.download(block, true);
     const int stepsSinceFailure = (int) std::lround(block[block.size() - 2]), code = (int) std::lround(block.back());
@@ -523,9 +567,18 @@ DeviceSteps::Report DeviceSteps::undo(int numSteps, bool hasSums) {
         half = 1 - half;
     failure.upload(vector<int>{0, 0});
     if (hasSums)
-        launchEvaluate(NO_STEP, false);
+        launchEvaluate(NO_STEP, Control::NothingChanged);
     vector<double> block;
     control[half].download(block, true);
+    // The end of the step before may have been looked at by the step that has failed alone, which leaves other sums.
+    if (settings.isAutomatic) {
+        vector<double> next;
+        control[1 - half].download(next, true);
+        std::copy(next.begin() + Control::FirstReference, next.end(), block.begin() + Control::FirstReference);
+        if (block[Control::IsShortened] != 0)
+            block[Control::Density] =
+                AutomaticRecursions::automaticDensity(&settings.choice, &block[Control::FirstNumber]);
+    }
     Report report = fill(block);
     report.state.hasHalfStepValue = report.state.hasHalfStepValue && hasSums;
     return report;
@@ -540,6 +593,12 @@ DeviceSteps::Report DeviceSteps::fill(const vector<double>& block) {
     report.u = block[Control::U];
     report.values.assign(block.begin() + Control::FirstValue,
                          block.begin() + Control::FirstValue + settings.terms.size());
+    if (settings.isAutomatic) {
+        std::copy_n(&block[Control::FirstNumber], Control::NumAutomaticNumbers,
+                    reinterpret_cast<double*>(&report.state.automatic));
+        std::copy_n(&block[Control::FirstReference], AutomaticControl::NUM_MONITORS, report.state.references);
+        report.values.assign(std::begin(report.state.automatic.values), std::end(report.state.automatic.values));
+    }
     report.elapsed = block[Control::Elapsed] - elapsedRead;
     report.numSteps = (int) std::lround(block[Control::Steps] - numStepsRead);
     report.numRescues = (int) std::lround(block[Control::Rescues] - numRescuesRead);

@@ -32,20 +32,27 @@ public:
         bool isFixedStep;
         double tolerance;
         std::vector<StepMonitor::Term> terms; // with the references in force
+        /** With automatic step control, in place of density, update and monitors: its choices, and the degrees of freedom. */
+        bool isAutomatic = false;
+        AutomaticRecursions::AutomaticChoice choice = {};
+        double numDegreesOfFreedom = 1;
     };
     /** What of the state is in the control block. */
     struct State {
-        double density;       // rho[n-1/2]
+        double density; // rho[n-1/2]
         double densityOffset; // what (3.14) and (3.15) differed by in the last step
         bool hasHalfStepValue;
         double halfStepValue; // u(q[n],p[n-1/2])
+        /** With automatic step control: its numbers and references. */
+        AutomaticRecursions::AutomaticNumbers automatic = {};
+        double references[AutomaticControl::NUM_MONITORS] = {};
     };
     struct Report {
         State state;
         double stepSize, elapsed; // of the last step, and since the last read() (ps)
         int numSteps, numRescues; // since the last read()
         double u;
-        std::vector<double> values; // u(q[n],p[n]) and U_k
+        std::vector<double> values; // u(q[n],p[n]) and U_k; with automatic step control U_A[n] and U_B[n-1/2]
         bool isShortened; // the last step was cut short
         bool hasFailed;
     };
@@ -66,8 +73,13 @@ public:
      * @return false if the constraints depend on each other or a monitor is no number
      */
     bool begin(const State& state, double groupEnergy);
-    /** Go on from positions, velocities and forces that are others now: the velocities are projected, the density is scaled with u. */
-    bool change(double groupEnergy);
+    /**
+     * Go on from positions, velocities and forces that are others now, or some of them: velocities are projected, the density is
+     * scaled with u. With automatic step control it matters what the velocities were, see keepVelocities().
+     */
+    bool change(double groupEnergy, Control::Change change);
+    /** Remember the velocities, which others are about to change. Does nothing where it does not matter. */
+    void keepVelocities();
 
     /** The first half of a step, which is not to be longer than maxStep. */
     void advance(double maxStep);
@@ -106,12 +118,13 @@ private:
     void setMixed(OpenMM::ComputeKernel& kernel, int index, double value);
     void setWide(OpenMM::ComputeKernel& kernel, int index, double value);
     void addLargeTables(OpenMM::ComputeKernel& kernel);
+    void addLastState(OpenMM::ComputeKernel& kernel);
     void launch(OpenMM::ComputeKernel& kernel, int numOwnArguments);
     int nextStamp();
     int getNumProjections() const;
     void launchLarge(OpenMM::ComputeKernel& kernel, int step, int numStages);
-    void launchFinish(int step, double kick, bool isFormed, bool isStored);
-    void launchEvaluate(int step, bool isRescaled);
+    void launchFinish(int step, double kick, Control::Change change, bool isStored);
+    void launchEvaluate(int step, Control::Change change);
     bool hasChangeFailed();
     Report undo(int numSteps, bool hasSums);
     Report fill(const std::vector<double>& block);
@@ -122,19 +135,21 @@ private:
     std::unique_ptr<StepProgram> program;
     bool isMixed, isWide; // mixed is double; there are doubles
     int groupSize;
-    int numGroups;   // of work, each of which leaves its sums
+    int numGroups; // of work, each of which leaves its sums
     int numPartials; // with the pieces of large clusters, which leave theirs behind
-    int numFused;    // pieces among the work groups of the small clusters
+    int numFused; // pieces among the work groups of the small clusters
     unsigned numLargeLaunches;
     long long numLaunches;
-    int half;       // the control block that is in force
+    int half; // the control block that is in force
     int stepNumber; // of the last advance()
-    int numTrials;  // launches for a density
+    int numTrials; // launches for a density
     double groupEnergy;
     double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
     OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2],
         reportArray;
     OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts;
+    OpenMM::ComputeArray lastForces, lastSquares, lastVelocities; // of automatic step control
+    bool areVelocitiesKept;
     OpenMM::ComputeArray largeTables, largePieces, largeRows, largeRowLengths, largeAtoms, largeJoints,
         largeJointLengths;
     OpenMM::ComputeArray largeMultipliers, largeFactors, largeWork, largeExchange, largePhases, largeIterations;

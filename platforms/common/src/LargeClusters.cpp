@@ -554,7 +554,7 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
                            channel,
                            tableSize,
                            tableSize + workWords,
-                           0};
+                           p == 0 ? (int) layouts.size() : 0};
             localSize = std::max({localSize, tableSize + workWords + factorWords, tableSize + limits.numThreads + 1});
             numFactors += layout.factorSize;
             numWork += layout.workSize;

@@ -42,7 +42,8 @@ public:
         int firstTable, tableSize, firstRow, numInner;
         int numBorders, firstAtom, numAtoms, firstJoint;
         int numJoints, firstKept, numKept, firstWork;
-        int channel, localWork, localFactor, unused;
+        int channel, localWork, localFactor;
+        int numPieces; // of the cluster, in the first of them; else 0
     };
     struct Row {
         int atom1, atom2;

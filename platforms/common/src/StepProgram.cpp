@@ -57,7 +57,13 @@ enum Quantity {
     SpeedSquares,   // sum |v|^2
     LargestForce,   // max |F|^2
     LargestArc,     // max |F|^2 + |v|^2
-    Failures        // of trials
+    Failures,       // of trials
+    // Of automatic step control, which adds them up itself (kernels/automatic.cc)
+    HardnessOnStep, // sum A_c^4
+    HardnessOnHalfStep,
+    AutomaticKinetic,
+    AutomaticChange,
+    AutomaticScale
 };
 enum Merge { Add, Largest, Power };
 struct QuantityText {
@@ -75,7 +81,12 @@ const map<Quantity, QuantityText> QUANTITIES = {{MultiplierSquares, {Add, true, 
                                                 {SpeedSquares, {Add, false, "dot3(v, v)"}},
                                                 {LargestForce, {Largest, false, "forceSquared"}},
                                                 {LargestArc, {Largest, false, "forceSquared + dot3(v, v)"}},
-                                                {Failures, {Add, false, nullptr}}};
+                                                {Failures, {Add, false, nullptr}},
+                                                {HardnessOnStep, {Power, false, nullptr}},
+                                                {HardnessOnHalfStep, {Power, false, nullptr}},
+                                                {AutomaticKinetic, {Add, false, nullptr}},
+                                                {AutomaticChange, {Add, false, nullptr}},
+                                                {AutomaticScale, {Add, false, nullptr}}};
 
 struct MonitorText {
     vector<Quantity> quantities;
@@ -127,10 +138,11 @@ bool StepProgram::usesSpeeds(const vector<StepMonitor::Term>& terms) {
 
 StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& large,
                          const vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide) :
-        update(update) {
+        numMonitors((int) terms.size()), update(update) {
     writeMonitors(terms);
     writeClusters(kinds);
     writeLargeClusters(large);
+    writeAutomaticControl((int) large.getPieces().size());
     source = DeviceSources::step;
     for (const auto& word : words)
         replaceAll(source, word.first, word.second);
@@ -139,6 +151,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"SUM", Sum},
                                       {"BOUNDED", Bounded},
                                       {"SEMI_EXPLICIT", SemiExplicit},
+                                      {"AUTOMATIC", Automatic},
                                       {"UPDATE", update},
                                       {"HALF_SUMS", update == SemiExplicit ? 1 : 0},
                                       {"NUM_MONITORS", (int) terms.size()},
@@ -158,7 +171,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"IS_SHORTENED", Control::IsShortened},
                                       {"MOST_TRIALS", Control::MostTrials},
                                       {"FIRST_VALUE", Control::FirstValue},
-                                      {"CONTROL_SIZE", Control::FirstValue + (int) terms.size()},
+                                      {"CONTROL_SIZE", getControlSize()},
                                       {"NOMINAL", Control::Nominal},
                                       {"SMALLEST", Control::Smallest},
                                       {"LOWER", Control::Lower},
@@ -227,6 +240,13 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
         replaceAll(value, "$p", literal(1 / terms[k].order));
         values += "values[" + to_string(k) + "] = " + value + ";\n    ";
     }
+    if (update == Automatic) {
+        defines["SUM_ON_STEP"] = to_string(add(Key(HardnessOnStep, 4)));
+        defines["SUM_HALF_STEP"] = to_string(add(Key(HardnessOnHalfStep, 4)));
+        defines["SUM_KINETIC"] = to_string(add(Key(AutomaticKinetic, 0)));
+        defines["SUM_CHANGE"] = to_string(add(Key(AutomaticChange, 0)));
+        defines["SUM_SCALE"] = to_string(add(Key(AutomaticScale, 0)));
+    }
     if (hasHalfSums() || numSums == 0) // an array has at least one element
         defines["FAILURES"] = to_string(add(Key(Failures, 0)));
     string constraintTerms, particleTerms, mergeTerms, powers;
@@ -249,7 +269,8 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
         case Power: {
             const string name =
                 "Power_" + to_string(orders.insert({entry.first.second, (int) orders.size()}).first->second);
-            text += "add" + name + "(sums + " + address + ", " + quantity.term + ");\n    ";
+            if (quantity.term != nullptr)
+                text += "add" + name + "(sums + " + address + ", " + quantity.term + ");\n    ";
             mergeTerms += "merge" + name + "(sums + " + address + ", other + " + address + ");\n    ";
             break;
         }
@@ -307,8 +328,10 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
                             "const int c = slot - " + to_string(numSlots) + ";\n            if (c < " +
                             to_string(count) + ")\n                ";
         const string tail = ";\n        }\n        ";
-        finishCases += head + "isRegular = finish" + name +
-                       "(c, CLUSTER_ARGUMENTS, kick*dt, halfKick, formHalf, isStored != 0, sums, halfSums)" + tail;
+        finishCases +=
+            head + "isRegular = finish" + name +
+            "(c, CLUSTER_ARGUMENTS, kick*dt, halfKick, formHalf, isStored != 0, sums, halfSums LAST_STATE_ARGUMENT)" +
+            tail;
         trialCases += head + "isSolved = try" + name + "(c, CLUSTER_ARGUMENTS, dt, tolerance, sums)" + tail;
         advanceCases += head + "iterations = advance" + name +
                         "(c, CLUSTER_ARGUMENTS, dt, tolerance, oldPositions, oldVelocities)" + tail;
@@ -341,4 +364,32 @@ void StepProgram::writeLargeClusters(const LargeClusters& large) {
     defines["NARROW"] = hasNarrow ? to_string(large.getNarrow()) : "NUM_THREADS";
     defines["SYNC_NARROW"] = hasNarrow ? "__syncwarp()" : "SYNC_PIECE";
     defines["MAX_POLLS"] = to_string(form.isStaged ? 1 : MAX_POLLS);
+}
+
+void StepProgram::writeAutomaticControl(int numPieces) {
+    string& text = words["AUTOMATIC_CONTROL"];
+    const bool isAutomatic = update == Automatic;
+    defines["NUM_APART"] = to_string(isAutomatic ? numPieces : 0);
+    if (!isAutomatic) {
+        for (const char* empty : {"LAST_STATE_PARAMETERS", "LAST_STATE_PARAMETER", "LAST_STATE_ARGUMENT",
+                                  "MAKE_LAST_STATE(kick, dt, change)"})
+            text += string("#define ") + empty + "\n";
+        return;
+    }
+    text = DeviceSources::automatic;
+    replaceAll(text, "AUTOMATIC_RECURSIONS", DeviceSources::AutomaticRecursions);
+    const map<string, int> numbers = {{"NUM_PIECES", numPieces},
+                                      {"NUM_CHOICES", Control::NumAutomaticChoices},
+                                      {"NUM_NUMBERS", Control::NumAutomaticNumbers},
+                                      {"FIRST_REFERENCE", Control::FirstReference},
+                                      {"FIRST_NUMBER", Control::FirstNumber},
+                                      {"IS_ACCEPTED", Control::IsAccepted},
+                                      {"ALL_CHANGED", Control::AllChanged},
+                                      {"VELOCITIES_CHANGED", Control::VelocitiesChanged},
+                                      {"FORCES_CHANGED", Control::ForcesChanged}};
+    for (const auto& number : numbers)
+        defines[number.first] = to_string(number.second);
+    defines["LENGTH_WEIGHT"] = literal(1 / AutomaticControl::LENGTH);
+    defines["FLIGHT_WEIGHT"] = literal(1 / (AutomaticControl::FLIGHT * AutomaticControl::FLIGHT));
+    defines["CHANGE_WEIGHT"] = literal(AutomaticControl::CHANGE_WEIGHT);
 }

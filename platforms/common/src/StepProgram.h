@@ -6,6 +6,7 @@
 
 #include "ClusterKinds.h"
 #include "LargeClusters.h"
+#include "step/AutomaticControl.h"
 #include "step/StepDensity.h"
 #include "step/StepMonitor.h"
 #include <map>
@@ -33,7 +34,14 @@ enum Field {
     MostTrials,    // of a density, since the host has looked last
     FirstValue     // U_k
 };
-/** The settings; the weight, the power and the reference value of each monitor follow. */
+/** With automatic step control other numbers follow, and a word whether they are those at the end of the last step. */
+const int NumAutomaticNumbers = sizeof(AutomaticRecursions::AutomaticNumbers) / sizeof(double);
+const int FirstReference = FirstValue, FirstNumber = FirstReference + AutomaticControl::NUM_MONITORS;
+const int IsAccepted = FirstNumber + NumAutomaticNumbers, AutomaticSize = IsAccepted + 1;
+/**
+ * The settings; the weight, the power and the reference value of each monitor follow, or with automatic step control the choices of its
+ * recursions, and 1/f, by which twice the kinetic energy is multiplied.
+ */
 enum Setting {
     Nominal,  // h
     Smallest, // a = h/maximum
@@ -46,6 +54,9 @@ enum Setting {
 };
 /** What makes a step fail; the slot of the cluster is above. Irregular are constraints that depend on each other, and forces. */
 enum Failure { NotConverged, InvalidMonitor, Irregular, UnsolvedDensity, NumCodes };
+const int NumAutomaticChoices = sizeof(AutomaticRecursions::AutomaticChoice) / sizeof(double);
+/** What others have changed between two steps. */
+enum Change { NothingChanged, AllChanged, VelocitiesChanged, ForcesChanged };
 /** Numbers of the trial of a density. */
 const int TrialSize = 9;
 } // namespace Control
@@ -56,7 +67,7 @@ const int TrialSize = 9;
  */
 class StepProgram {
 public:
-    enum Update { Fixed, Sum, Bounded, SemiExplicit };
+    enum Update { Fixed, Sum, Bounded, SemiExplicit, Automatic };
     /** Where the data of a kind lie. */
     struct Place {
         int firstSlot, firstAtom, firstLength;
@@ -68,7 +79,7 @@ public:
     /**
      * @param kinds         the clusters that one thread can have
      * @param large         the others
-     * @param terms         the monitors
+     * @param terms         the monitors; none with automatic step control
      * @param update        how the density is found
      * @param isMixed       whether positions and velocities are in double precision
      * @param isWide        whether the device has doubles
@@ -104,15 +115,23 @@ public:
     bool hasHalfSums() const {
         return update == SemiExplicit;
     }
+    /** Words of the control block and of the settings. */
+    int getControlSize() const {
+        return update == Automatic ? Control::AutomaticSize : Control::FirstValue + numMonitors;
+    }
+    int getNumSettings() const {
+        return Control::FirstTerm + (update == Automatic ? Control::NumAutomaticChoices + 1 : 3 * numMonitors);
+    }
 
 private:
     void writeMonitors(const std::vector<StepMonitor::Term>& terms);
     void writeClusters(const std::vector<ClusterKind>& kinds);
     void writeLargeClusters(const LargeClusters& large);
+    void writeAutomaticControl(int numPieces);
     std::string source;
     std::map<std::string, std::string> defines, words;
     std::vector<Place> places;
-    int numSlots, numSums;
+    int numMonitors, numSlots, numSums;
     Update update;
 };
 

@@ -2,7 +2,8 @@
 // SPDX-License-Identifier: MIT
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
-// with graphs "common" (hydrogens on heavy atoms, rigid water), "all" (of up to eight constraints, the densest among them), "large" (a
+// with the numbers of a monitor and an update (3 for automatic step control, which needs no monitor), and graphs "common" (hydrogens
+// on heavy atoms, rigid water), "all" (of up to eight constraints, the densest among them), "large" (a
 // long chain too, in pieces that wait for each other), or "dense" (many bonds on one particle).
 
 #include "StepProgram.h"
@@ -47,14 +48,18 @@ int main(int argc, char** argv) {
         bonds.emplace_back(graphs == "large" ? i : 0, i + 1);
     if (graphs == "large" || graphs == "dense")
         add(bonds);
-    const vector<StepMonitor::Term> terms = {{(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1}};
-    const StepDensity::Update update = (StepDensity::Update) std::stoi(argv[3]);
+    const int updateNumber = std::stoi(argv[3]);
+    const bool isAutomatic = updateNumber == 3;
+    vector<StepMonitor::Term> terms;
+    if (!isAutomatic)
+        terms.push_back({(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1});
+    const StepProgram::Update update =
+        isAutomatic ? StepProgram::Automatic : StepProgram::updateOf(terms, false, (StepDensity::Update) updateNumber);
     const ClusterKinds kinds(system);
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
     const LargeClusters large(kinds.large,
                               {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
-    const StepProgram program(kinds.small, large, terms, StepProgram::updateOf(terms, false, update),
-                              precision != "single", true);
+    const StepProgram program(kinds.small, large, terms, update, precision != "single", true);
     for (const auto& define : program.getDefines())
         std::cout << "#define " << define.first << " " << define.second << "\n";
     std::cout << program.getSource();

@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 
 CONSTRAINT_AND_APPLIED_FORCE, MULTIPLIER_P_NORM = 3, 4
-SEMI_EXPLICIT, EXPLICIT = 0, 1
+SEMI_EXPLICIT, EXPLICIT, AUTOMATIC = 0, 1, 3
 # Precision, monitor, update, graphs, architectures. The program for SemiExplicit has every kernel, and the largest.
 CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
@@ -28,6 +28,9 @@ CASES = (
     ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "large", ("sm_70", "sm_90")),
     ("double", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_90",)),
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "dense", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_70", "sm_90")),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_90",)),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "large", ("sm_90",)),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.

@@ -63,7 +63,8 @@ struct Molecules {
     OpenMM::CustomExternalForce* field;
 
     explicit Molecules(int copies) : random(7) {
-        field = new OpenMM::CustomExternalForce("200*(x^2+y^2+z^2)+80*cos(9*x)*sin(7*y+5*z)");
+        field = new OpenMM::CustomExternalForce("strength*(200*(x^2+y^2+z^2)+80*cos(9*x)*sin(7*y+5*z))");
+        field->addGlobalParameter("strength", 1);
         auto* bonds = new OpenMM::HarmonicBondForce();
         const vector<vector<std::pair<int, int>>> graphs = {
             {{0, 1}, {0, 2}, {1, 2}},                                                         // water
@@ -174,11 +175,38 @@ struct Both {
             stepOnHost();
         handOver();
     }
+    // The same with automatic step control; references of 0 are to be found, in so many steps.
+    void startAutomatic(const Molecules& molecules, int learningSteps, double onStep, double halfStep) {
+        start(molecules, StepDensity::Explicit, {});
+        settings.isAutomatic = true;
+        settings.automaticReferences[0] = onStep;
+        settings.automaticReferences[1] = halfStep;
+        settings.calibrationSteps = learningSteps;
+        settings.automaticRequest++;
+        dynamics.setSettings(settings);
+        vector<Vec3> forces = forcesAt(molecules.positions);
+        dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
+        for (int i = 0; i < 5; i++)
+            stepOnHost();
+        handOver();
+    }
     void handOver() {
         const VRattleDynamics::Memory memory = dynamics.getMemory();
         const double energy = groupEnergyAt(dynamics.getPositions());
         computeForces();
         context.setVelocities(dynamics.getVelocities());
+        if (settings.isAutomatic) {
+            DeviceSteps::Settings to = {
+                settings.stepSize, StepDensity(), settings.update, false, settings.tolerance, {}};
+            to.isAutomatic = true;
+            to.choice = dynamics.getAutomaticControl().getChoice();
+            to.numDegreesOfFreedom = dynamics.getAutomaticControl().getNumDegreesOfFreedom();
+            device.setSettings(to);
+            DeviceSteps::State state = {memory.density, 0, false, 0, memory.automatic};
+            std::copy(memory.references.begin(), memory.references.end(), state.references);
+            ASSERT(device.begin(state, energy));
+            return;
+        }
         vector<StepMonitor::Term> terms = settings.terms;
         for (size_t k = 0; k < terms.size(); k++)
             terms[k].reference = memory.references[k];
@@ -231,9 +259,44 @@ struct Both {
         ASSERT_EQUAL(0, report.numRescues);
         ASSERT(largestDifference(positions(), dynamics.getPositions()) <= distance);
         ASSERT(largestDifference(velocities(), dynamics.getVelocities()) <= speed);
-        for (size_t k = 0; k < settings.terms.size(); k++)
+        ASSERT_EQUAL(dynamics.getMonitorValues().size(), report.values.size());
+        for (size_t k = 0; k < report.values.size(); k++)
             ASSERT_EQUAL_TOL(dynamics.getMonitorValues()[k], report.values[k], fraction);
         ASSERT_EQUAL_TOL(dynamics.getDensity(), report.state.density, fraction);
+        if (settings.isAutomatic)
+            requireAutomaticAgreement(report.state, fraction);
+    }
+    void requireAutomaticAgreement(const DeviceSteps::State& found, double fraction) {
+        const AutomaticControl::Memory expected = dynamics.getMemory().automatic;
+        const auto agree = [&](double a, double b) {
+            ASSERT(std::fabs(a - b) <= fraction * std::max(1.0, std::fabs(a)));
+        };
+        for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++) {
+            agree(expected.behind[k], found.automatic.behind[k]);
+            agree(expected.ahead[k], found.automatic.ahead[k]);
+            agree(expected.logarithms[k], found.automatic.logarithms[k]);
+            ASSERT_EQUAL_TOL(dynamics.getReferences()[k], found.references[k], fraction);
+        }
+        ASSERT_EQUAL(expected.stepsSinceStart, found.automatic.stepsSinceStart);
+        ASSERT_EQUAL(expected.numLearnt, found.automatic.numLearnt);
+        agree(expected.temperature, found.automatic.temperature);
+        ASSERT_EQUAL(expected.following, found.automatic.following);
+        ASSERT_EQUAL(expected.shortSteps, found.automatic.shortSteps);
+        ASSERT_EQUAL(expected.mostShortSteps, found.automatic.mostShortSteps);
+    }
+    // Steps of both, and the device's state is put back into the Context.
+    void requireStepsToAgree(int count, double maxStep, double distance, double fraction) {
+        for (int i = 0; i < count; i++)
+            stepOnDevice(i == count - 1 ? maxStep : NO_LIMIT);
+        const DeviceSteps::Report report = device.read();
+        ASSERT_EQUAL(count, report.numSteps);
+        const vector<Vec3> after = positions(), velocitiesAfter = velocities();
+        for (int i = 0; i < count; i++)
+            stepOnHost(i == count - 1 ? maxStep : NO_LIMIT);
+        context.setPositions(after);
+        context.setVelocities(velocitiesAfter);
+        computeForces();
+        requireAgreement(report, distance, 1000 * distance, fraction);
     }
 };
 
@@ -476,7 +539,7 @@ void testChangedVelocities() {
         both.context.setVelocities(velocities);
         const double energy = both.groupEnergy();
         both.computeForces();
-        ASSERT(both.device.change(energy));
+        ASSERT(both.device.change(energy, Control::VelocitiesChanged));
         both.requireAgreement(both.device.read(), 1e-13, 1e-10, 1e-9);
         both.stepOnDevice();
         const DeviceSteps::Report report = both.device.read();
@@ -487,6 +550,66 @@ void testChangedVelocities() {
         // The device forms the half-step momentum anew, with the scaled density; the host changes its own.
         both.requireAgreement(report, 1e-6, 1e-4, 1e-4);
     }
+}
+
+// Automatic step control: references that are found and given, steps that are short or cut short, changes of all kinds, and the number
+// of launches.
+void testAutomaticControl(const Molecules& molecules, const std::string& precision, double distance, double fraction) {
+    Both both(molecules, precision);
+    ContextImpl& context = both.lender.getContext();
+    const auto changeVelocities = [&](double size) {
+        vector<Vec3> velocities = both.velocities();
+        for (size_t i = 0; i < velocities.size(); i++)
+            if (molecules.masses[i] > 0)
+                velocities[i] += Vec3(std::sin(i), std::cos(2 * i), 1) * size;
+        both.device.keepVelocities();
+        both.dynamics.changeVelocities(velocities);
+        both.context.setVelocities(velocities);
+        both.computeForces();
+        ASSERT(both.device.change(0, Control::VelocitiesChanged));
+        both.requireAgreement(both.device.read(), distance, 1000 * distance, fraction);
+    };
+    both.startAutomatic(molecules, 8, 0, 0);
+    both.requireStepsToAgree(1, NO_LIMIT, distance, fraction);
+    ASSERT_EQUAL(0.0, both.dynamics.getReferences()[0]);
+    both.requireStepsToAgree(5, NO_LIMIT, distance, 10 * fraction);
+    const vector<double> references = both.dynamics.getReferences();
+    ASSERT(references[0] > 0);
+    // Far outside the dead zone.
+    both.startAutomatic(molecules, 8, references[0] / 20, references[1] / 30);
+    const long long before = both.device.getNumLaunches();
+    both.requireStepsToAgree(20, NO_LIMIT, 100 * distance, 100 * fraction);
+    // As many launches as the update Explicit, and one to read.
+    const LargeClusters& large = both.device.getLargeClusters();
+    const int numLarge = large.isEmpty() ? 0 : large.getForm().isStaged ? 3 + 16 : 2;
+    ASSERT_EQUAL(20 * (2 + numLarge) + 1, both.device.getNumLaunches() - before);
+    ASSERT(both.dynamics.getDensity() > 3);
+    both.requireStepsToAgree(3, 0.0001, 100 * distance, 100 * fraction);
+    both.requireStepsToAgree(3, 0.00001, 100 * distance, 100 * fraction);
+    // References that follow.
+    both.startAutomatic(molecules, 2, 0, 0);
+    changeVelocities(1e-9);
+    ASSERT_EQUAL(0.0, both.dynamics.getMemory().automatic.following);
+    changeVelocities(0.5);
+    ASSERT_EQUAL(1000.0, both.dynamics.getMemory().automatic.following);
+    both.requireStepsToAgree(5, NO_LIMIT, 10 * distance, 100 * fraction);
+    context.setParameter("strength", 1.3);
+    vector<Vec3> forces = both.forcesAt(both.positions());
+    both.dynamics.changeForces(forces, 0);
+    both.computeForces();
+    ASSERT(both.device.change(0, Control::ForcesChanged));
+    both.requireAgreement(both.device.read(), 10 * distance, 10000 * distance, 100 * fraction);
+    both.requireStepsToAgree(5, NO_LIMIT, 100 * distance, 100 * fraction);
+    vector<Vec3> positions = both.positions();
+    for (Vec3& position : positions)
+        position += Vec3(0.02, 0.01, -0.03);
+    forces = both.forcesAt(positions);
+    both.dynamics.changeState(positions, both.velocities(), forces, 0);
+    both.computeForces();
+    ASSERT(both.device.change(0, Control::AllChanged));
+    both.requireAgreement(both.device.read(), 100 * distance, 100000 * distance, 100 * fraction);
+    both.requireStepsToAgree(5, NO_LIMIT, 100 * distance, 100 * fraction);
+    context.setParameter("strength", 1);
 }
 
 // A cluster that cannot be solved in step 31 of 60, beside others that can: a dumbbell, or a zigzag, that flies into a wall.
@@ -590,6 +713,10 @@ int main(int argc, char** argv) {
         {"division into pieces", testDivision},
         {"launches", testNumLaunches},
         {"changed velocities", testChangedVelocities},
+        {"automatic step control, double", [] { testAutomaticControl(Molecules(2), "double", 1e-12, 1e-9); }},
+        {"automatic step control of large clusters, double",
+         [] { testAutomaticControl(makeMolecules({makeChain(20), makeProtein(30)}), "double", 1e-12, 1e-9); }},
+        {"automatic step control, single", [] { testAutomaticControl(Molecules(2), "single", 1e-6, 1e-3); }},
         {"a failure leaves the state before, double", [] { testFailureLeavesTheStateBefore("double"); }},
         {"a failure leaves the state before, single", [] { testFailureLeavesTheStateBefore("single"); }},
         {"a failure of a large cluster leaves the state before, double",

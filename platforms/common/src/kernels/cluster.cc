@@ -45,7 +45,7 @@ inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mi
 }
 
 /** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
-inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums) {
+inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed x[NUM_ATOMS][3], v[NUM_ATOMS][3], a[NUM_ATOMS][3], w[NUM_ATOMS], forceSquared[NUM_ATOMS];
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
@@ -54,6 +54,11 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
         w[i] = loadVelocity(velm, atom, v[i]);
         forceSquared[i] = loadAcceleration(force, paddedNumAtoms, atom, w[i], a[i]);
     }
+#if UPDATE == AUTOMATIC
+    mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        followForce(terms, last, force, paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], v[i][0], v[i][1], v[i][2]);
+#endif
 #if HALF_SUMS
     mixed before[NUM_ATOMS][3];
 #endif
@@ -91,6 +96,12 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
         push_KIND(r, w, x1, halfKick, before);
     }
     measure_KIND(r, L, before, a, w, forceSquared, x1, halfSums);
+#endif
+#if UPDATE == AUTOMATIC
+    push_KIND(r, w, x1, -1, a); // F - G^T Lambda
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        addAutomaticTerms(terms, last, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], forceSquared[i], w[i], v[i], a[i]);
+    addCluster(sums, terms, last, atoms[ATOM_BASE + c]);
 #endif
     return isRegular;
 }

@@ -22,7 +22,11 @@
 #else
 #define THREAD LOCAL_ID
 #define SYNC_PIECE SYNC_THREADS
+#if UPDATE == AUTOMATIC
+#define MERGE_SUMS(sums) addTermsInGroup(sums, buffer)
+#else
 #define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
+#endif
 #define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
 #endif
 
@@ -306,6 +310,9 @@ typedef struct {
     int isWritten;       // positions and velocities are changed
     int canFail;         // failures are written down
     mixed tolerance;
+#if UPDATE == AUTOMATIC
+    LastState last;
+#endif
 } LargeTask;
 
 /**
@@ -431,7 +438,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         }
         UNROLL for (int d = 0; d < 3; d++) {
             D[3*i+d] = (mode == FINISH ? v[d] + task.dt*a[d] : task.dt*(v[d] + task.dt/2*a[d]));
-#if HALF_SUMS
+#if HALF_SUMS || UPDATE == AUTOMATIC
             if (mode == FINISH)
                 before[3*i+d] = v[d];
 #endif
@@ -653,6 +660,15 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     addParticleTerms(sums, forceSquared, w, v);
                 else
                     addParticleTerms(halfSums, forceSquared, w, v);
+#if UPDATE == AUTOMATIC
+                if (mode == FINISH && task.canFail) { // what the task adds up are terms
+                    const int atom = pieceAtoms[firstAtom+i];
+                    UNROLL for (int d = 0; d < 3; d++)
+                        a[d] -= w*push[d];
+                    followForce(sums, task.last, force, paddedNumAtoms, atom, w, before[3*i], before[3*i+1], before[3*i+2]);
+                    addAutomaticTerms(sums, task.last, atom, forceSquared, w, v, a);
+                }
+#endif
 #if HALF_SUMS
                 if (mode == FINISH)
                     UNROLL for (int d = 0; d < 3; d++)
@@ -745,6 +761,10 @@ inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask 
             sums[j] = halfSums[j] = 0;
         const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
         MERGE_SUMS(sums);
+#if UPDATE == AUTOMATIC
+        if (THREAD == 0 && task.canFail && (completed & 1) != 0)
+            closePiece(sums, task.last, pieceAtoms[pieces[4*piece+1].y], pieces[4*piece+3].w);
+#endif
         if (THREAD == 0 && task.canFail && (completed & 1) != 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 partials[j*numPartials + numPartials - numPieces + piece] = sums[j];
@@ -805,13 +825,16 @@ inline DEVICE LargeTask makeTask(int step, int firstStage, int endStage, int sta
     return task;
 }
 
-inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage, int stamp, int numProjections, mixed dt, mixed halfKick, bool formHalf, bool isStored, bool isFrozen) {
+inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage, int stamp, int numProjections, mixed dt, mixed halfKick, bool formHalf, bool isStored, bool isFrozen LAST_STATE_PARAMETER) {
     LargeTask task = makeTask(step, firstStage, endStage, stamp, dt, 0);
     task.numProjections = numProjections;
     task.halfKick = halfKick;
     task.formHalf = formHalf;
     task.isWritten = (isStored && !isFrozen);
     task.canFail = !isFrozen;
+#if UPDATE == AUTOMATIC
+    task.last = last;
+#endif
     return task;
 }
 
@@ -829,10 +852,11 @@ inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage
 /** finishStep for the pieces. */
 KERNEL void finishLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed kick, int isFormed, int isStored, int numProjections,
         GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL mixed* RESTRICT partials, int numPartials, int numPieces,
-        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS LAST_STATE_PARAMETERS) {
     LARGE_MEMORY
+    MAKE_LAST_STATE(kick, (mixed) control[STEP_SIZE], isFormed)
     const LargeTask task = makeFinishingTask(step, firstStage, endStage, stamp, numProjections, kick*(mixed) control[STEP_SIZE],
-            (mixed) (settings[NOMINAL]/(2*control[DENSITY])), isFormed || control[IS_SHORTENED] != 0, isStored != 0, failure[0] != 0);
+            (mixed) (settings[NOMINAL]/(2*control[DENSITY])), isFormed || control[IS_SHORTENED] != 0, isStored != 0, failure[0] != 0 LAST_STATE_ARGUMENT);
     finishPieces(GROUP_ID, numPieces, NUM_GROUPS, task, partials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
 }
 

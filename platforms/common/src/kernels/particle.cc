@@ -3,7 +3,7 @@
 
 // A particle that is in no constraint. The functions are those of cluster.cc.
 
-inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums) {
+inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
     const int atom = atoms[ATOM_BASE + c];
     mixed w[3], v[3], a[3];
     const mixed inverseMass = loadVelocity(velm, atom, w);
@@ -18,6 +18,12 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
         UNROLL for (int d = 0; d < 3; d++)
             w[d] = v[d] - halfKick*a[d];
     addParticleTerms(halfSums, forceSquared, inverseMass, w);
+#endif
+#if UPDATE == AUTOMATIC
+    mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
+    followForce(terms, last, force, paddedNumAtoms, atom, inverseMass, w[0], w[1], w[2]);
+    addAutomaticTerms(terms, last, atom, forceSquared, inverseMass, v, a);
+    addCluster(sums, terms, last, atom);
 #endif
     return forceSquared >= 0;
 }

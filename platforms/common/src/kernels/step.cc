@@ -65,6 +65,16 @@ inline DEVICE mixed loadAcceleration(GLOBAL const mm_long* RESTRICT force, int p
     return isNumber ? square : (mixed) -1;
 }
 
+/** f(rho) = (rho - a) - (1 - a)^2/(rho - a) and its inverse (docs/method.md, section 3). */
+inline DEVICE wide stretch(wide rho, wide a) {
+    return rho - a - (1 - a)*(1 - a)/(rho - a);
+}
+
+inline DEVICE wide unstretch(wide y, wide a) {
+    const wide c = 1 - a, root = sqrt(y*y + 4*c*c);
+    return a + (y > 0 ? (y + root)/2 : 2*c*c/(root - y));
+}
+
 // ---------------------------------------------------------------------------------------------------------------- the monitors
 
 POWER_FUNCTIONS
@@ -82,6 +92,8 @@ inline DEVICE void addParticleTerms(mixed* sums, mixed forceSquared, mixed w, co
 inline DEVICE void mergeSums(mixed* sums, const mixed* other) {
     MERGE_TERMS
 }
+
+AUTOMATIC_CONTROL
 
 /** u = B(combination of U_k/U_k,ref) (docs/method.md, sections 4 and 6) from the sums; -1 if a monitor is no number. */
 inline DEVICE wide evaluateMonitors(const mixed* sums, wide groupEnergy, GLOBAL const wide* RESTRICT settings, wide* values) {
@@ -122,26 +134,19 @@ inline DEVICE void mergeInGroup(mixed* sums, LOCAL_ARG mixed* buffer) {
 inline DEVICE void gatherSums(int numPartials, GLOBAL const mixed* RESTRICT partials, mixed* sums, LOCAL_ARG mixed* buffer) {
     for (int j = 0; j < NUM_SUMS; j++)
         sums[j] = 0;
-    for (int i = LOCAL_ID; i < numPartials; i += GROUP_SIZE) {
+    for (int i = LOCAL_ID; i < numPartials - NUM_APART; i += GROUP_SIZE) {
         mixed other[NUM_SUMS];
         for (int j = 0; j < NUM_SUMS; j++)
             other[j] = partials[j*numPartials + i];
         mergeSums(sums, other);
     }
+#if NUM_APART > 0
+    addClustersOfPieces(numPartials, partials, sums);
+#endif
     mergeInGroup(sums, buffer);
 }
 
 // -------------------------------------------------------------------------------------------------------------- the step density
-
-/** f(rho) = (rho - a) - (1 - a)^2/(rho - a) and its inverse (docs/method.md, section 3). */
-inline DEVICE wide stretch(wide rho, wide a) {
-    return rho - a - (1 - a)*(1 - a)/(rho - a);
-}
-
-inline DEVICE wide unstretch(wide y, wide a) {
-    const wide c = 1 - a, root = sqrt(y*y + 4*c*c);
-    return a + (y > 0 ? (y + root)/2 : 2*c*c/(root - y));
-}
 
 inline DEVICE wide boundedUpdate(wide u, wide rho, wide a) {
     const wide least = a + (wide) BOUND_MARGIN*(1 - a);
@@ -168,6 +173,9 @@ inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL c
     now[DENSITY_OFFSET] = (isShortened ? now[DENSITY_OFFSET] : rho - (2*u - previous));
     now[IS_SHORTENED] = (isShortened ? 1 : 0);
     now[IS_HALF_KNOWN] = 0;
+#if UPDATE == AUTOMATIC
+    now[IS_ACCEPTED] = 0;
+#endif
     now[STEPS] += 1;
     // The time in two numbers, so that a float loses none of it.
     const wide step = now[STEP_SIZE] + now[ELAPSED_REST], sum = now[ELAPSED] + step;
@@ -207,14 +215,15 @@ LARGE_CLUSTERS
  * The second half of a step, after its forces (3.12)-(3.13): on-step velocities, Lambda, and the sums of the monitors there; where
  * the update needs them also those at the half-step velocities, behind the others.
  *
- * kick is 1/2 for a step. A state changed by others takes 0, and isFormed: the half-step velocities are then formed from the
- * on-step ones. Without isStored the velocities are left as they are.
+ * kick is 1/2 for a step. A state changed by others takes 0, and isFormed, which says what: the half-step velocities are then formed
+ * from the on-step ones. Without isStored the velocities are left as they are.
  */
 KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
-        GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS FUSED_PARAMETERS) {
+        GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS FUSED_PARAMETERS LAST_STATE_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     FUSED_MEMORY
     const mixed dt = (mixed) control[STEP_SIZE];
+    MAKE_LAST_STATE(kick, dt, isFormed)
     // After a shortened step the half-step velocities are formed anew, as those of a step of the density that goes on.
     const bool formHalf = (isFormed || control[IS_SHORTENED] != 0);
     const mixed halfKick = (mixed) (settings[NOMINAL]/(2*control[DENSITY]));
@@ -232,7 +241,7 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
     const bool isFrozen = (failure[0] != 0);
 #if IS_FUSED
     if (GROUP_ID < NUM_FUSED) {
-        const LargeTask task = makeFinishingTask(step, 0, MAX_STAGES, stamp, numProjections, kick*dt, halfKick, formHalf, isStored != 0, isFrozen);
+        const LargeTask task = makeFinishingTask(step, 0, MAX_STAGES, stamp, numProjections, kick*dt, halfKick, formHalf, isStored != 0, isFrozen LAST_STATE_ARGUMENT);
         finishPieces(GROUP_ID, NUM_FUSED, NUM_FUSED, task, partials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
         return;
     }
@@ -258,11 +267,11 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
 }
 
 /**
- * Evaluate the monitors at the on-step state, for the host to read; of one work group. With isRescaled, after a jump of the state,
+ * Evaluate the monitors at the on-step state, for the host to read; of one work group. Where others have changed it (change is not 0)
  * the density keeps its ratio to u. A monitor that is no number makes the step that has led here fail. The report is the control
  * block and behind it how many steps ago one has failed (-1 for none) and why.
  */
-KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
+KERNEL void evaluateState(int step, int change, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
         GLOBAL const mixed* RESTRICT partials, GLOBAL int* RESTRICT failure, GLOBAL wide* RESTRICT report) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
@@ -272,6 +281,10 @@ KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPar
     SYNC_THREADS;
     gatherSums(numPartials, partials + NUM_SUMS*numPartials, halfSums, buffer);
 #endif
+#if UPDATE == AUTOMATIC
+    if (LOCAL_ID == 0 && failure[0] == 0 && !evaluateAutomaticState(sums, change, control, settings))
+        fail(failure, step, INVALID_MONITOR);
+#else
     if (LOCAL_ID == 0 && failure[0] == 0) {
 #if HALF_SUMS
         if (control[IS_HALF_KNOWN] == 0)
@@ -281,13 +294,14 @@ KERNEL void evaluateState(int step, int isRescaled, wide groupEnergy, int numPar
         if (u < 0)
             fail(failure, step, INVALID_MONITOR);
         else {
-            if (isRescaled && u > 0 && control[MONITOR_U] > 0)
+            if (change != 0 && u > 0 && control[MONITOR_U] > 0)
                 control[DENSITY] *= u/control[MONITOR_U];
             control[MONITOR_U] = u;
             for (int k = 0; k < NUM_MONITORS; k++)
                 control[FIRST_VALUE + k] = values[k];
         }
     }
+#endif
     if (LOCAL_ID == 0) {
         for (int i = 0; i < CONTROL_SIZE; i++)
             report[i] = control[i];
@@ -422,12 +436,17 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         wide rho = (isSolved ? trial[TRIAL_DENSITY] : (wide) 1);
         now[MISMATCH_SLOPE] = trial[TRIAL_SLOPE];
         now[MOST_TRIALS] = max(now[MOST_TRIALS], trial[TRIAL_COUNT]);
+#elif UPDATE == AUTOMATIC
+        const wide u = (areMonitorsValid(sums) ? (wide) 1 : (wide) -1);
+        const bool isSolved = true;
+        acceptAutomaticStep(sums, now, settings);
+        wide rho = nextAutomaticDensity(now, settings);
 #else
         const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
         const bool isSolved = true;
         wide rho = nextDensity(u, now, settings);
 #endif
-#if UPDATE != FIXED && UPDATE != BOUNDED
+#if UPDATE == SUM || UPDATE == SEMI_EXPLICIT
         // A rescue: the sum gave no step, or one far above the maximum.
         if (!(rho > 0) || rho < settings[SMALLEST]/2) {
             rho = boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
