@@ -26,6 +26,8 @@ const double FLIGHT_LENGTH = 0.0125, POWER = 2.0 / 3.0, TRIGGER = 2.2;
 const double FLOOR = 0.5, FLOOR_PART = 0.2, LARGEST_START = 4, FOLLOWING_RATE = 0.002;
 // What is thermal in a bath that is colder than this (K).
 const double COLDEST = 10;
+// A step of substeps whose U is more than this multiple of the floor, of a bath of these K or the one there is, teaches nothing.
+const double LARGEST_THERMAL = 16, ROOM_TEMPERATURE = 300;
 // A change of all velocities by less than this part of their mean size leaves U what it is.
 const double SMALL_SHIFT = 0.05;
 // The drifts are solved to this fraction of the tolerance: what is left is not the same forwards and backwards.
@@ -71,7 +73,7 @@ void LangevinDynamics::setSettings(const Settings& newSettings) {
     if (settings.langevin.reference > 0)
         reference = settings.langevin.reference;
     else if (reference > 0)
-        reference = std::max(reference, findFloor());
+        reference = std::max(reference, findFloor(COLDEST));
 }
 
 void LangevinDynamics::setRandomState(const vector<double>& state) {
@@ -88,22 +90,25 @@ void LangevinDynamics::setReferences(const vector<double>& references) {
 
 // In thermal motion each A_c is as large as its number of particles N_c, and U as S = (sum_c N_c^4)^(1/8): 24 for a protein of 580 atoms
 // that is one cluster, 2 for eight rigid waters, times what a particle has for itself.
-double LangevinDynamics::findFloor() const {
-    const double kT = BOLTZMANN * std::max(settings.langevin.temperature, COLDEST);
+double LangevinDynamics::findFloor(double coldest) const {
+    const double kT = BOLTZMANN * std::max(settings.langevin.temperature, coldest);
     return settings.stepSize > 0 ? std::max(FLOOR, FLOOR_PART * systemSize) * std::sqrt(kT) / settings.stepSize : 0.0;
 }
 
 void LangevinDynamics::startReference() {
     if (reference == 0)
-        reference = std::max(findFloor(), std::min(values[0], LARGEST_START * findFloor()));
+        reference = std::max(findFloor(COLDEST), std::min(values[0], LARGEST_START * findFloor(COLDEST)));
 }
 
-// A running median: nothing can capture it, whatever the steps were made of.
+// A running median. The heat of a clash must not teach it what is calm: where it leaves by less than the rate in a step, through a low
+// friction or small steps, U_ref would meet U at a temperature that steps without substeps keep up by their own errors.
 void LangevinDynamics::followReference() {
     if (settings.langevin.reference > 0 || settings.langevin.isReferenceFrozen)
         return;
+    if (doublings > 0 && values[0] > std::max(reference, LARGEST_THERMAL * findFloor(ROOM_TEMPERATURE)))
+        return;
     const double rate = values[0] > reference ? FOLLOWING_RATE : values[0] < reference ? -FOLLOWING_RATE : 0.0;
-    reference = std::max(findFloor(), reference * std::exp(rate));
+    reference = std::max(findFloor(COLDEST), reference * std::exp(rate));
 }
 
 // k, without its bound.

@@ -371,6 +371,43 @@ void testReference() {
     ASSERT_EQUAL(7.0, dynamics.getReferences()[0]);
 }
 
+// The reference does not follow what is hotter than thermal motion in steps of substeps, and so is what it was when the heat of a
+// clash has left, however slowly that is.
+void testHeatDoesNotCaptureTheReference() {
+    for (double temperature : {300.0, 10.0}) {
+        Example e = makeExample();
+        LangevinDynamics dynamics = makeDynamics(e);
+        LangevinDynamics::Settings settings = makeSettings();
+        settings.stepSize = 0.001;
+        settings.tolerance = 1e-8;
+        settings.langevin.temperature = temperature;
+        dynamics.setSettings(settings);
+        begin(dynamics, e);
+        takeStep(dynamics);
+        const double floor = 0.5 * std::sqrt(BOLTZMANN * temperature) / settings.stepSize;
+        const double largest = 16 * 0.5 * std::sqrt(BOLTZMANN * 300) / settings.stepSize;
+        Vectors hot = dynamics.getVelocities();
+        for (Vec3& each : hot)
+            each *= 40;
+        dynamics.changeVelocities(hot);
+        int numHot = 0, numWarm = 0;
+        for (int i = 0; i < 2000; i++) {
+            const double before = dynamics.getReferences()[0];
+            const long long substepped = dynamics.getNumSubstepped();
+            takeStep(dynamics);
+            const double u = dynamics.getMonitorValues()[0], after = dynamics.getReferences()[0];
+            const bool isHot = dynamics.getNumSubstepped() > substepped && u > largest;
+            numHot += isHot && u > before;
+            numWarm += !isHot && u > before;
+            const double follows = std::max(floor, before * std::exp(u > before ? 0.002 : -0.002));
+            ASSERT_EQUAL_TOL(isHot && u > before ? before : follows, after, 1e-12);
+        }
+        std::cout << temperature << " K: " << numHot << " steps were too hot to follow, " << numWarm << " were not"
+                  << std::endl;
+        ASSERT(numHot > 20 && numWarm > 20);
+    }
+}
+
 // The same to the last bit on any number of threads.
 void testThreads() {
     vector<Vectors> ends;
@@ -410,6 +447,7 @@ int main() {
         {"RandomNumbers", testRandomNumbers},
         {"FailureLeavesTheState", testFailureLeavesTheState},
         {"Reference", testReference},
+        {"HeatDoesNotCaptureTheReference", testHeatDoesNotCaptureTheReference},
         {"Threads", testThreads},
     });
 }

@@ -11,6 +11,7 @@ import numpy as np
 
 BOLTZMANN = 0.00831446261815324
 FLIGHT_LENGTH, POWER, TRIGGER, FLOOR, FLOOR_PART, RATE = 0.0125, 2 / 3, 2.2, 0.5, 0.2, 0.002
+LARGEST_THERMAL, ROOM_TEMPERATURE = 16, 300
 
 
 def philox(counter: np.ndarray, key: tuple[int, int]) -> np.ndarray:
@@ -153,7 +154,9 @@ class Statement:
             except ArithmeticError:
                 assert k < self.largest
             k += 1
-        self.reference = max(floor, self.reference * np.exp(RATE * np.sign(u - self.reference)))
+        warm = floor * np.sqrt(max(self.temperature, ROOM_TEMPERATURE) / max(self.temperature, 10))
+        if k == 0 or u <= max(self.reference, LARGEST_THERMAL * warm):
+            self.reference = max(floor, self.reference * np.exp(RATE * np.sign(u - self.reference)))
         return end, velocity, k
 
     def reversed_noise(self) -> np.ndarray:
