@@ -1,11 +1,12 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""Variable steps on a platform for which this package has no kernels, such as a GPU with OpenCL, CUDA or HIP.
+"""Variable steps on any platform, there and back: how exactly does a run retrace its way?
 
-Eight rigid waters on the fastest platform of this machine, there and back: the integrator is turned round after some
-steps, retraces its way, and the distance from the start is printed. Beside it stands the largest energy error.
+Eight rigid waters on the fastest platform of this machine: the integrator is turned round after some steps, retraces
+its way, and the distance from the start is printed. Beside it stands the largest energy error. With --custom it is the
+integrator that is written in Python alone.
 
-    python examples/any_platform.py [--platform OpenCL] [--precision mixed] [--steps 200]
+    python examples/any_platform.py [--platform OpenCL] [--precision mixed] [--steps 200] [--custom]
 """
 
 from __future__ import annotations
@@ -15,24 +16,23 @@ import argparse
 import numpy as np
 import openmm
 from openmm import unit
-from openmmvrattle import CustomVariableStepRattleIntegrator
+from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
+from openmmvrattle.platforms import add_platform_arguments, platform_and_properties, platform_from
 from openmmvrattle.testsystems import rigid_waters
 
 
-def fastest_platform() -> openmm.Platform:
+def fastest_platform() -> str:
     """The platform that OpenMM would choose by itself."""
     platforms = [openmm.Platform.getPlatform(i) for i in range(openmm.Platform.getNumPlatforms())]
-    return max(platforms, key=lambda platform: platform.getSpeed())
+    return max(platforms, key=lambda platform: platform.getSpeed()).getName()
 
 
-def there_and_back(platform: openmm.Platform, precision: str, steps: int) -> tuple[float, float, np.ndarray]:
+def there_and_back(platform: str, steps: int, custom: bool = False) -> tuple[float, float, np.ndarray]:
     """The distance from the start (nm), the largest energy error (kJ/mol), and the sizes of the steps (ps)."""
     water = rigid_waters()
-    integrator = CustomVariableStepRattleIntegrator(
-        1 * unit.femtosecond, monitors=[CustomVariableStepRattleIntegrator.ConstraintAndAppliedForce]
-    )
-    properties = {"Precision": precision} if "Precision" in platform.getPropertyNames() else {}
-    context = openmm.Context(water.system, integrator, platform, properties)
+    kind = CustomVariableStepRattleIntegrator if custom else VariableStepRattleIntegrator
+    integrator = kind(1 * unit.femtosecond, monitors=[kind.ConstraintAndAppliedForce])
+    context = openmm.Context(water.system, integrator, *platform_and_properties(platform))
     context.setPositions(water.positions)
     context.setVelocities(water.velocities)
     energies, sizes = [], []
@@ -52,13 +52,16 @@ def there_and_back(platform: openmm.Platform, precision: str, steps: int) -> tup
 def main() -> None:
     """Run the example from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--platform", help="name of a platform of OpenMM (default: the fastest)")
-    parser.add_argument("--precision", choices=["single", "mixed", "double"], default="mixed")
+    add_platform_arguments(parser, "the fastest")
     parser.add_argument("--steps", type=int, default=200)
-    arguments = parser.parse_args()
-    platform = openmm.Platform.getPlatform(arguments.platform) if arguments.platform else fastest_platform()
-    distance, energy_error, sizes = there_and_back(platform, arguments.precision, arguments.steps)
-    print(f"{arguments.steps} steps of {1e3 * sizes.min():.2f} to {1e3 * sizes.max():.2f} fs on {platform.getName()}")
+    parser.add_argument("--custom", action="store_true", help="the integrator that is written in Python alone")
+    options = parser.parse_args()
+    try:
+        platform = platform_from(options, fastest_platform())
+    except ValueError as error:
+        parser.error(f"{error}.")
+    distance, energy_error, sizes = there_and_back(platform, options.steps, options.custom)
+    print(f"{options.steps} steps of {1e3 * sizes.min():.2f} to {1e3 * sizes.max():.2f} fs on {platform}")
     print(f"energy within {energy_error:.3f} kJ/mol")
     print(f"there and back: {distance:.1e} nm from the start")
 

@@ -8,7 +8,7 @@ directions of r. With r held by a constraint, the mean of its multiplier is the 
 no other term, as for a distance 1/m1 + 1/m2 is constant (Carter, Ciccotti, Hynes and Kapral, Chem. Phys. Lett. 156
 (1989) 472). The scan needs one Context: each r is a new value of the constraint's parameter.
 
-    python examples/blue_moon.py
+    python examples/blue_moon.py [--platform NAME] [--precision NAME]
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 import openmm
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator, constraints
+from openmmvrattle.platforms import command_line_platform
 
 TEMPERATURE = 300.0  # K
 KT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin) * TEMPERATURE
@@ -45,7 +46,9 @@ def known_mean_force(distance: float) -> float:
     return WELL * (distance - REST) + (1.5 * POWER - 2) * KT / distance
 
 
-def make_context(copies: int, seed: int) -> tuple[VariableStepRattleIntegrator, openmm.Context]:
+def make_context(
+    copies: int, seed: int, platform: openmm.Platform, properties: dict[str, str]
+) -> tuple[VariableStepRattleIntegrator, openmm.Context]:
     """Independent copies side by side: their constraints share an expression and are evaluated together."""
     system = openmm.System()
     energy = f"{WELL / 2}*(r-{REST})^2 + {SPRING / 2}*(r/{REST})^{POWER}*(x3^2+y3^2+z3^2); r = distance(p1,p2)"
@@ -59,7 +62,7 @@ def make_context(copies: int, seed: int) -> tuple[VariableStepRattleIntegrator, 
             system.addParticle(mass)
         force.addBond([3 * copy, 3 * copy + 1, 3 * copy + 2], [])
         constraints.fix_distance(integrator, 3 * copy, 3 * copy + 1, DISTANCES[0])
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context = openmm.Context(system, integrator, platform, properties)
     random = np.random.default_rng(seed)
     positions = np.zeros((copies, 3, 3))
     positions[:, 1] = random.normal(size=(copies, 3))
@@ -70,9 +73,11 @@ def make_context(copies: int, seed: int) -> tuple[VariableStepRattleIntegrator, 
     return integrator, context
 
 
-def scan(copies: int = 200, windows: int = 40, seed: int = 1) -> list[MeanForce]:
+def scan(
+    platform: openmm.Platform, properties: dict[str, str], copies: int = 200, windows: int = 40, seed: int = 1
+) -> list[MeanForce]:
     """The mean force at every distance, from copies times windows stretches with fresh velocities."""
-    integrator, context = make_context(copies, seed)
+    integrator, context = make_context(copies, seed, platform, properties)
     random = np.random.default_rng(seed)
     results = []
     for n, distance in enumerate(DISTANCES):
@@ -96,7 +101,7 @@ def scan(copies: int = 200, windows: int = 40, seed: int = 1) -> list[MeanForce]
 
 def main() -> None:
     """Print the mean force and the free energy beside the known ones."""
-    results = scan()
+    results = scan(*command_line_platform("Reference"))
     print("r (nm)   dF/dr found        known (kJ/mol/nm)   deviation / standard error")
     for each in results:
         known = known_mean_force(each.distance)

@@ -5,15 +5,16 @@
 Minimising the energy would move the molecules to another place. Here the clash is part of the dynamics, as in a shock
 or after a sudden change, and the energy that it sets free must be neither lost nor made up.
 
-    python examples/clash_relaxation.py
+    python examples/clash_relaxation.py [--platform NAME] [--precision NAME]
 """
 
 import openmm
 from openmmvrattle import VariableStepRattleIntegrator, advise
+from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.testsystems import water_clash
 
 clash = water_clash()
-reference = openmm.Platform.getPlatformByName("Reference")
+platform, properties = command_line_platform("Reference")
 
 # Which steps? A trial run with fixed steps tells: the force on the worst particle is what to watch.
 advice = advise(clash.system, clash.positions, clash.velocities, step_size=0.00025, steps=800)
@@ -22,7 +23,7 @@ print(advice)
 fixed = VariableStepRattleIntegrator(0.00025)
 fixed.clearMonitors()
 for name, integrator in (("fixed steps", fixed), ("variable steps", advice.make_integrator())):
-    context = openmm.Context(clash.system, integrator, reference)
+    context = openmm.Context(clash.system, integrator, platform, properties)
     context.setPositions(clash.positions)
     context.setVelocities(clash.velocities)
     energies, steps = [], []

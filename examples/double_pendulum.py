@@ -30,6 +30,7 @@ import numpy as np
 import openmm
 from matplotlib.figure import Figure
 from openmmvrattle.compare.comparison import Series, envelope, make_integrator, two_digits
+from openmmvrattle.platforms import add_platform_arguments, make_context, platform_from
 from openmmvrattle.testsystems import MonitorSettings, StepControl, double_pendulum
 from rich import box
 from rich.console import Console
@@ -42,6 +43,9 @@ QUICK_TIME = 2.0
 """ps; the first whip is at 1.57 ps."""
 EXCHANGED_TIME = 12.0
 """ps; with the masses exchanged, whatever the time of the others, since that takes few steps."""
+
+platform = "Reference"
+"""On which everything runs; ``--platform`` names another."""
 
 Progress = Callable[[str], None]
 """Called with what is about to be run."""
@@ -134,7 +138,7 @@ def run_pendulum(
     """
     pendulum = double_pendulum(*masses)
     integrator = make_integrator(control)
-    context = openmm.Context(pendulum.system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context = make_context(pendulum.system, integrator, platform)
     context.setPositions(pendulum.positions)
     context.setVelocities(pendulum.velocities)
     times, energies, sizes = [], [], []
@@ -578,7 +582,12 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--time", type=float, help=f"simulated time in ps (default: {TIME:g})")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_TIME:g} ps only, which have one whip")
+    add_platform_arguments(parser, platform)
     options = parser.parse_args(arguments)
+    try:
+        options.platform = platform_from(options, "Reference")
+    except ValueError as error:
+        parser.error(f"{error}.")
     if options.time is None:
         options.time = QUICK_TIME if options.quick else TIME
     if not (options.time > 0.0 and math.isfinite(options.time)):
@@ -588,7 +597,9 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, draw, print and write; returns the exit status."""
+    global platform
     options = _arguments(arguments)
+    platform = options.platform
     console = Console()
     try:
         options.output.mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,7 @@ import numpy as np
 import openmm
 from matplotlib.figure import Figure
 from openmmvrattle.compare.comparison import Series, make_integrator, two_digits
+from openmmvrattle.platforms import add_platform_arguments, make_context, platform_from
 from openmmvrattle.testsystems import MonitorSettings, StepControl, TestSystem, elastic_rod
 from rich import box
 from rich.console import Console
@@ -50,6 +51,9 @@ QUICK_STEPS = STEPS[1:3]
 MOST_STEPS = 20_000
 LATER_START = 0.06
 """ps; a start from which the end of the rod is on its way to the wall already."""
+
+platform = "Reference"
+"""On which everything runs; ``--platform`` names another."""
 
 Progress = Callable[[str], None]
 """Called with what is about to be run."""
@@ -141,7 +145,7 @@ class Recorder:
     def __init__(self, rod: TestSystem, integrator: Any, start: float = 0.0) -> None:
         self.rod, self.integrator = rod, integrator
         rod.prepare(integrator)
-        self.context = openmm.Context(rod.system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        self.context = make_context(rod.system, integrator, platform)
         self.context.setPositions(rod.positions)
         self.context.setVelocities(rod.velocities)
         self.times, self.energies, self.sizes = [start], [], [math.nan]
@@ -847,12 +851,20 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--output", type=Path, default=Path("out/elastic_rod"), help="folder of the files (default: %(default)s)"
     )
     parser.add_argument("--quick", action="store_true", help="runs of about 350 and 1,000 steps only")
-    return parser.parse_args(arguments)
+    add_platform_arguments(parser, platform)
+    options = parser.parse_args(arguments)
+    try:
+        options.platform = platform_from(options, "Reference")
+    except ValueError as error:
+        parser.error(f"{error}.")
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, draw, print and write; returns the exit status."""
+    global platform
     options = _arguments(arguments)
+    platform = options.platform
     console = Console()
     try:
         options.output.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ OpenMM's LangevinMiddleIntegrator ends with "Particle coordinate is NaN", or far
 of a few substeps each, until the worst contacts have come apart, and from then on a step costs one evaluation of the
 forces. This is no minimisation: the heat of the bad start is real, and leaves through the friction.
 
-    python examples/no_minimisation.py
+    python examples/no_minimisation.py [--platform NAME] [--precision NAME]
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import openmm
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleLangevinIntegrator
+from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.testsystems import alanine_dipeptide
 
 STEP = 0.004  # ps
@@ -42,7 +43,7 @@ def run(integrator: openmm.Integrator) -> None:
     """Print the energy and the temperature along a run."""
     topology, system, positions = solvated_peptide()
     degrees = 3 * system.getNumParticles() - system.getNumConstraints() - 3
-    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatform("CPU"))
+    simulation = app.Simulation(topology, system, integrator, *command_line_platform("CPU"))
     simulation.context.setPositions(positions)
     print(f"\n{type(integrator).__name__}, {1000 * STEP:g} fs\n steps  potential energy (kJ/mol)  temperature (K)")
     try:

@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: MIT
 """Water at constant energy, with reports at equal times: how the energy keeps, and how the steps go.
 
-python examples/nve_water.py
+python examples/nve_water.py [--platform NAME] [--precision NAME]
 """
 
 import csv
 
-import openmm
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import rigid_waters
 
 water = rigid_waters(32)  # a droplet of 32 rigid TIP3P molecules at 300 K
 integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # ps
-simulation = app.Simulation(water.topology, water.system, integrator, openmm.Platform.getPlatformByName("CPU"))
+simulation = app.Simulation(water.topology, water.system, integrator, *command_line_platform("CPU"))
 simulation.context.setPositions(water.positions)
 simulation.context.setVelocities(water.velocities)
 

@@ -6,7 +6,7 @@ A chain of rigid bonds hangs from a fixed point in gravity, and its end is pulle
 bond is the size of the force that holds up what lies below it: the weight of those beads and the pull. The multiplier
 of the constraint |r|^2 - d^2 = 0 is half the tension over the length of the bond.
 
-    python examples/pulled_chain.py
+    python examples/pulled_chain.py [--platform NAME] [--precision NAME]
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import openmm
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.platforms import command_line_platform
 
 BEADS, LENGTH, MASS = 10, 0.15, 14.0  # nm, amu
 GRAVITY, PULL = 10.0, 500.0  # nm/ps^2, kJ/mol/nm
@@ -31,7 +32,7 @@ def statics() -> tuple[np.ndarray, np.ndarray]:
     return positions, tension
 
 
-def tensions_from_multipliers() -> np.ndarray:
+def tensions_from_multipliers(platform: openmm.Platform, properties: dict[str, str]) -> np.ndarray:
     """The same tensions from getMultipliers(), at the state of rest."""
     system = openmm.System()
     system.addParticle(1e15)  # the point of suspension: as good as fixed
@@ -47,7 +48,7 @@ def tensions_from_multipliers() -> np.ndarray:
     system.addForce(weight)
     system.addForce(pull)
     integrator = VariableStepRattleIntegrator(0.001)
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context = openmm.Context(system, integrator, platform, properties)
     context.setPositions(statics()[0])
     multipliers = integrator.getMultipliers().value_in_unit(unit.kilojoule_per_mole / unit.nanometer**2)
     return 2 * np.array(multipliers) * LENGTH
@@ -56,7 +57,7 @@ def tensions_from_multipliers() -> np.ndarray:
 def main() -> None:
     """Print both side by side."""
     _, expected = statics()
-    found = tensions_from_multipliers()
+    found = tensions_from_multipliers(*command_line_platform("Reference"))
     print("bond  tension from statics  from the multipliers (kJ/mol/nm)")
     for k, (a, b) in enumerate(zip(expected, found, strict=True)):
         print(f"{k:4d}  {a:20.6f}  {b:20.6f}")

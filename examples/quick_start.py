@@ -1,14 +1,18 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""A double pendulum: the steps shrink by orders of magnitude in each whip, and the energy stays."""
+"""A double pendulum: the steps shrink by orders of magnitude in each whip, and the energy stays.
+
+python examples/quick_start.py [--platform NAME] [--precision NAME]
+"""
 
 import openmm
 from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.testsystems import double_pendulum
 
 pendulum = double_pendulum()
 integrator = VariableStepRattleIntegrator(0.0005, automatic=True)  # ps, the size of steps while nothing unusual happens
-context = openmm.Context(pendulum.system, integrator, openmm.Platform.getPlatformByName("Reference"))
+context = openmm.Context(pendulum.system, integrator, *command_line_platform("Reference"))
 context.setPositions(pendulum.positions)
 context.setVelocities(pendulum.velocities)
 for _ in range(20):

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: MIT
 """An OpenMM script whose VerletIntegrator was swapped for ours: what changes is marked with "was" and "new".
 
-python examples/swap_verlet.py
+python examples/swap_verlet.py [--platform NAME] [--precision NAME]
 """
 
-import openmm
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator  # new
+from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.testsystems import alanine_dipeptide
 
 # In a script of your own these three come from app.PDBFile and ForceField.createSystem(..., constraints=app.HBonds).
@@ -17,7 +17,7 @@ topology, system, positions = molecule.topology, molecule.system, molecule.posit
 # was: integrator = openmm.VerletIntegrator(0.001)
 integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # new: shorter steps when something unusual happens
 
-simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("CPU"))
+simulation = app.Simulation(topology, system, integrator, *command_line_platform("CPU"))
 simulation.context.setPositions(positions)
 simulation.context.setVelocitiesToTemperature(300 * unit.kelvin, 1)
 simulation.reporters.append(

@@ -172,6 +172,11 @@ public:
         return 0;
     }
 
+    /** Whether the last step() was for a GPU to take, and not for the host with forces from it. */
+    virtual bool hasSteppedOnDevice() {
+        return false;
+    }
+
     // ---------------------------------------------------------------------------------------- automatic step control
 
     /** A value of its monitors that is no more than this is nothing but rounding. */

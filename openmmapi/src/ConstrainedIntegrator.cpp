@@ -154,6 +154,10 @@ long long ConstrainedIntegrator::getNumForceEvaluations() const {
     return run == nullptr ? 0 : run->getDevice().getNumForceEvaluations();
 }
 
+bool ConstrainedIntegrator::isOnDevice() const {
+    return run != nullptr && run->getDevice().hasSteppedOnDevice();
+}
+
 long long ConstrainedIntegrator::getNumSolverIterations() const {
     return run == nullptr ? 0 : run->getDevice().getNumSolverIterations();
 }

@@ -1,12 +1,14 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""The command ``info``: versions, platforms, and what is wrong with the installation."""
+"""The command ``info``: versions, what each platform can do, and what is wrong with the installation.
+
+What it says of a platform it finds out by trying: a small system takes steps there, and the integrator tells by what.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import importlib.metadata
 import json
 import os
@@ -14,21 +16,39 @@ import platform
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import openmm
 
 import openmmvrattle
 
+from .platforms import make_context
+
 _PACKAGES = ("numpy", "matplotlib", "rich", "distributed", "pandas")
+_VERSION = ".".join(openmm.Platform.getOpenMMVersion().split(".")[:2])
+_BROUGHT_BY = {"CUDA": f'"openmm[cuda12]=={_VERSION}.*" or [cuda13]', "HIP": f'"openmm[hip6]=={_VERSION}.*" or [hip7]'}
+"""What pip installs for a platform that the package openmm does not have by itself."""
+_GPUS = {"CUDA", "HIP", "OpenCL"}
+_STEPS = 60
+"""To take in a trial. Automatic step control looks at the first 30 before it does anything."""
+
+
+@dataclass(frozen=True)
+class _Use:
+    """A use of an integrator, to be tried on each platform."""
+
+    integrator: str
+    make: Callable[[], Any]
 
 
 def add_parser(commands: Any) -> None:
     """Add the command to the command line."""
     parser = commands.add_parser(
         "info",
-        help="versions, platforms, and what is wrong with the installation",
-        description="Show versions, on which platforms the integrators run, and libraries that could not be loaded. "
+        help="versions, what each platform can do, and what is wrong with the installation",
+        description="Show versions, on which platforms the integrators run and what takes their steps there, and "
+        "libraries that could not be loaded. "
         "The exit status is 0 if the integrators run on all platforms that have a device, and 1 otherwise.",
     )
     parser.set_defaults(run=run)
@@ -48,10 +68,15 @@ def run(options: argparse.Namespace) -> int:
 def information() -> dict[str, Any]:
     """Find out everything that the command shows."""
     platforms = [openmm.Platform.getPlatform(index) for index in range(openmm.Platform.getNumPlatforms())]
+    found: dict[str, dict[str, str | None]] = {}
+    steps: dict[str, dict[str, str | None]] = {}
     with _standard_output_to_error():
-        found = {
-            each.getName(): {name: _problem(make, each) for name, make in _integrators().items()} for each in platforms
-        }
+        for each in platforms:
+            tried = {name: _try(use, each.getName()) for name, use in _uses().items()}
+            steps[each.getName()] = {name: where for name, (_, where) in tried.items()}
+            problems = found.setdefault(each.getName(), {})
+            for name, use in _uses().items():
+                problems[use.integrator] = problems.get(use.integrator) or tried[name][0]
     failures = {
         "OpenMM-VRATTLE": list(openmmvrattle.pluginLoadFailures),
         "OpenMM": list(openmm.Platform.getPluginLoadFailures()),
@@ -65,6 +90,8 @@ def information() -> dict[str, Any]:
         "healthy": works and not failures["OpenMM-VRATTLE"],
         "versions": _versions(),
         "platforms": found,
+        "steps": steps,
+        "platforms_not_here": sorted(promised - set(found)),
         "plugin_load_failures": failures,
         "folder": str(next(iter(openmmvrattle.__path__))),
     }
@@ -114,48 +141,55 @@ def _swig_runtime() -> str:
     return " and ".join(found) or "unknown"
 
 
-def _integrators() -> dict[str, Callable[[], openmm.Integrator]]:
-    """What can be tried on a platform."""
+def _uses() -> dict[str, _Use]:
+    """What is tried on a platform, by the heading of its column."""
 
-    def make(name: str) -> openmm.Integrator:
-        return getattr(openmmvrattle, name)(0.001)
+    def variable(**settings: Any) -> Any:
+        return openmmvrattle.VariableStepRattleIntegrator(0.001, **settings)
 
-    names = ("VariableStepRattleIntegrator", "CustomVariableStepRattleIntegrator")
-    return {name: functools.partial(make, name) for name in names}
+    def with_expression() -> Any:
+        integrator = variable()
+        integrator.addConstraint("z1", [2])
+        return integrator
+
+    ours, langevin = "VariableStepRattleIntegrator", "VariableStepRattleLangevinIntegrator"
+    custom = "CustomVariableStepRattleIntegrator"
+    return {
+        "monitors": _Use(ours, variable),
+        "automatic": _Use(ours, lambda: variable(automatic=True)),
+        "expressions": _Use(ours, with_expression),
+        "constant temperature": _Use(langevin, lambda: getattr(openmmvrattle, langevin)(300, 1, 0.001)),
+        "Python alone": _Use(custom, lambda: getattr(openmmvrattle, custom)(0.001)),
+    }
 
 
-def _problem(make: Callable[[], openmm.Integrator], on: openmm.Platform) -> str | None:
-    """Let two bonded particles take a step; None if they do, otherwise what OpenMM says."""
+def _try(use: _Use, on: str) -> tuple[str | None, str | None]:
+    """Let a rigid pair of particles and a third one take steps.
+
+    Returns:
+        What OpenMM says if they do not, or None; and what takes the steps, "device" or "host", or None.
+    """
     system = openmm.System()
-    for _ in range(2):
+    for _ in range(3):
         system.addParticle(1.0)
     system.addConstraint(0, 1, 0.1)
     try:
-        integrator = make()
-        context = openmm.Context(system, integrator, on)
-        context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
-        context.setVelocities([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-        integrator.step(1)
+        integrator = use.make()
+        context = make_context(system, integrator, on)
+        context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        context.setVelocities([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+        integrator.step(_STEPS)
+        if not isinstance(integrator, openmm.CustomIntegrator):
+            return None, "device" if integrator.isOnDevice() else "host"
     except Exception as error:
-        return " ".join(str(error).split()) or type(error).__name__
-    return None
+        return " ".join(str(error).split()) or type(error).__name__, None
+    return None, "device"
 
 
 def _print(content: dict[str, Any]) -> None:
     print("Versions")
     _print_columns(content["versions"].items())
-    print("\nWhere the integrators run")
-    names = list(next(iter(content["platforms"].values()), {}))
-    rows = [("platform", *names)]
-    remarks = []
-    for name, problems in content["platforms"].items():
-        rows.append((name, *("yes" if problem is None else "no" for problem in problems.values())))
-        remarks += [f"- {each} on {name}: {problem}" for each, problem in problems.items() if problem is not None]
-    _print_columns(rows)
-    if remarks:
-        print("\nWhat OpenMM says where they do not")
-    for remark in remarks:
-        print(remark)
+    _print_platforms(content)
     for whose, failures in content["plugin_load_failures"].items():
         if failures:
             print(f"\nLibraries of {whose} that could not be loaded")
@@ -179,3 +213,31 @@ def _print_columns(rows: Iterable[Sequence[str]]) -> None:
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         print("  " + "  ".join(cells).rstrip())
+
+
+def _print_platforms(content: dict[str, Any]) -> None:
+    print("\nWhat takes the steps of the integrators")
+    names = list(next(iter(content["steps"].values()), {}))
+    rows = [("platform", *names)]
+    for platform_name, steps in content["steps"].items():
+        # Reference and CPU have no device beside the host.
+        cells = {"host": "host", "device": "GPU"} if platform_name in _GPUS else {"host": "yes", "device": "yes"}
+        rows.append((platform_name, *(cells.get(steps[name], "no") for name in names)))
+    _print_columns(rows)
+    if _GPUS & set(content["steps"]):
+        print("  host: by the processor, with forces from the GPU; that is slow for large systems.")
+    problems = [
+        f"- {integrator} on {platform_name}: {problem}"
+        for platform_name, found in content["platforms"].items()
+        for integrator, problem in found.items()
+        if problem is not None
+    ]
+    if problems:
+        print("\nWhat OpenMM says where they do not run")
+    for line in problems:
+        print(line)
+    missing = content["platforms_not_here"]
+    if missing:
+        print("\nPlatforms that OpenMM does not have here")
+    for name in missing:
+        print(f"- {name}" + (f": pip install {_BROUGHT_BY[name]} brings it" if name in _BROUGHT_BY else ""))

@@ -186,6 +186,18 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         """
         return super().getNumSolverIterations()
 
+    def isOnDevice(self) -> bool:
+        """Tell whether the last step was taken by a GPU, on OpenCL, CUDA and HIP, and not on the host with forces from
+        there, which is slow for large systems. The first step of a run always is the host's. What else is left to the
+        host is in docs/gpu.md.
+
+        Returns
+        -------
+        bool
+            True if by a GPU; False on Reference and CPU, and before the first step
+        """
+        return super().isOnDevice()
+
     def setConstraintTolerance(self, tol: float) -> None:
         """Set the relative tolerance of the constraints. Default: 1e-8.
 

@@ -7,11 +7,16 @@ from typing import Any
 
 import numpy as np
 import openmm
+import pytest
 from dense_reference import Array, energy_of, positions_of, value, velocities_of
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import constraint_error
 
+needs_opencl = pytest.mark.skipif(
+    "OpenCL" not in {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())},
+    reason="this OpenMM has no platform OpenCL",
+)
 BOLTZMANN = 0.00831446261815324
 FORCE_MONITOR = "ConstraintAndAppliedForce"
 

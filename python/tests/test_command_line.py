@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,7 +29,7 @@ from openmmvrattle.testsystems import (
     light_heavy_chain,
     rigid_waters,
 )
-from run_support import solvated
+from run_support import needs_opencl, solvated
 
 
 def run_command(*arguments: str, **options):
@@ -354,6 +356,36 @@ def test_advise_on_a_system_and_state(tmp_path: Path) -> None:
     assert max(abs(energy - energies[0]) for energy in energies) < 1e-3
 
 
+@needs_opencl
+def test_advise_and_compare_run_on_a_platform_by_name(tmp_path: Path) -> None:
+    """In any case of its letters, and with a precision."""
+    common = ("--system", "water-clash", "--platform", "opencl", "--precision", "double")
+    result = run_command("advise", *common)
+    assert result.returncode == 0, result.stderr
+    assert "platform OpenCL:double" in result.stdout
+    assert "Use variable steps: ForcePNorm^0.5" in result.stdout
+    result = run_command("compare", *common, "--integrators", "RATTLE", "Automatic", "--output", str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    with (tmp_path / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["platform"] for row in rows] == ["OpenCL:double"] * 2
+    fixed, automatic = (float(row["largest_energy_error"]) for row in rows)
+    assert fixed > 20 * automatic  # 100 times on Reference
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--precision", "double"], "give --platform NAME as well"),
+        (["--platform", "Reference", "--precision", "double"], "has no choice of precision"),
+    ],
+)
+def test_a_precision_that_there_is_not(options: list[str], words: str) -> None:
+    result = run_command("advise", "--system", "rigid-waters", *options)
+    assert result.returncode == 2
+    assert words in result.stderr
+
+
 def test_advise_keeps_the_time_of_our_systems() -> None:
     result = run_command("advise", "--system", "nitrogen-collision-5", "--steps", "800")
     assert result.returncode == 0, result.stderr
@@ -371,6 +403,20 @@ def test_info() -> None:
     content = json.loads(run_command("info", "--json").stdout)
     assert content["healthy"] is True
     assert content["platforms"]["Reference"]["VariableStepRattleIntegrator"] is None
+    assert content["platforms"]["Reference"]["VariableStepRattleLangevinIntegrator"] is None
+    names = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
+    assert set(content["steps"]) == names
+    assert set(content["platforms_not_here"]) == {"CUDA", "HIP", "OpenCL", "CPU", "Reference"} - names
+    for name in content["platforms_not_here"]:
+        assert f"- {name}: pip install" in result.stdout
+    for name, uses in content["steps"].items():
+        assert set(uses) == {"monitors", "automatic", "expressions", "constant temperature", "Python alone"}
+        if name in ("Reference", "CPU"):
+            assert all(uses[use] == "host" for use in list(uses)[:4])
+            assert re.search(rf"^  {name} +yes +yes +yes +yes +yes$", result.stdout, re.MULTILINE)
+        elif content["platforms"][name]["VariableStepRattleIntegrator"] is None:  # there is a device
+            assert uses["monitors"] == "device"
+            assert re.search(rf"^  {name} +GPU ", result.stdout, re.MULTILINE)
     assert content["versions"]["openmm-vrattle"] == openmmvrattle.__version__
     assert content["versions"]["OpenMM"].startswith("8.6")
     assert content["versions"]["SWIG runtime"].isdigit()
@@ -381,11 +427,11 @@ def test_what_a_platform_prints_is_not_in_the_output_of_info() -> None:
     script = (
         "import os, sys\n"
         "from openmmvrattle import info\n"
-        "make = info._integrators()['CustomVariableStepRattleIntegrator']\n"
+        "use = info._uses()['Python alone']\n"
         "def loud():\n"
         "    os.write(1, b'a warning')\n"
-        "    return make()\n"
-        "info._integrators = lambda: {'VariableStepRattleIntegrator': loud}\n"
+        "    return use.make()\n"
+        "info._uses = lambda: {'monitors': info._Use('VariableStepRattleIntegrator', loud)}\n"
         "from openmmvrattle.__main__ import main\n"
         "main(['info', '--json'])\n"
     )
@@ -421,6 +467,6 @@ def test_info_tries_the_integrators(monkeypatch, capsys) -> None:
     def broken() -> openmm.Integrator:
         raise openmm.OpenMMException("it is broken [badly]")
 
-    monkeypatch.setattr(info, "_integrators", lambda: {"VariableStepRattleIntegrator": broken})
+    monkeypatch.setattr(info, "_uses", lambda: {"monitors": info._Use("VariableStepRattleIntegrator", broken)})
     assert command_line.main(["info"]) == 1
     assert "it is broken [badly]" in capsys.readouterr().out

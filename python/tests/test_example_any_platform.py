@@ -10,13 +10,15 @@ import sys
 from pathlib import Path
 
 import openmm
+import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "any_platform.py"
 
 
-def test_there_and_back() -> None:
+@pytest.mark.parametrize("custom", [False, True])
+def test_there_and_back(custom: bool) -> None:
     example = runpy.run_path(str(EXAMPLE))
-    distance, energy_error, sizes = example["there_and_back"](openmm.Platform.getPlatform("Reference"), "mixed", 50)
+    distance, energy_error, sizes = example["there_and_back"]("Reference", 50, custom)
     assert distance < 1e-7
     assert energy_error < 0.1
     assert len(sizes) == 100 and sizes.max() > 1.05 * sizes.min()

@@ -9,13 +9,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import openmm
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "blue_moon.py"
 
 
 def test_the_mean_force_is_the_known_one() -> None:
     example = runpy.run_path(str(EXAMPLE))
-    results = example["scan"](copies=200, windows=40, seed=5)
+    results = example["scan"](openmm.Platform.getPlatform("Reference"), {}, copies=200, windows=40, seed=5)
     errors = np.array([each.error for each in results])
     deviations = np.array([each.value - example["known_mean_force"](each.distance) for each in results])
     # The forces lie between 40 and 50 kJ/mol/nm; one of five independent numbers is beyond 4 errors once in 3000 times.

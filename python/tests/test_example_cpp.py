@@ -13,11 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import openmm
+from conftest import PRESENT
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import double_pendulum
 
 FOLDER = Path(__file__).parents[2] / "examples" / "cpp"
+
+
+def numbers(printed: str) -> list[list[float]]:
+    """Those of each line about a time."""
+    lines = [line for line in printed.splitlines() if line.startswith("time")]
+    return [[float(word) for word in re.findall(r"-?\d+\.?\d*(?:e[+-]\d+)?", line)] for line in lines]
 
 
 def test_it_does_what_python_does(tmp_path: Path) -> None:
@@ -27,7 +34,13 @@ def test_it_does_what_python_does(tmp_path: Path) -> None:
     subprocess.run(configure, check=True)
     subprocess.run([cmake, "--build", str(tmp_path)], check=True)
     printed = subprocess.run([str(tmp_path / "pendulum")], check=True, capture_output=True, text=True).stdout
-    lines = [[float(word) for word in re.findall(r"-?\d+\.?\d*(?:e[+-]\d+)?", line)] for line in printed.splitlines()]
+    lines = numbers(printed)
+    command = [str(tmp_path / "pendulum"), "--platform"]
+    on_cpu = subprocess.run([*command, "CPU"], check=True, capture_output=True, text=True).stdout
+    assert on_cpu == printed  # which runs the kernels of Reference, and its forces of these kinds
+    if "OpenCL" in PRESENT:
+        on_opencl = subprocess.run([*command, "OpenCL"], check=True, capture_output=True, text=True).stdout
+        np.testing.assert_allclose(numbers(on_opencl)[:6], lines[:6], rtol=0.06)
     assert len(lines) == 13
 
     pendulum = double_pendulum()

@@ -16,8 +16,10 @@ import openmm
 import pytest
 from openmm import app, unit
 from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
+from openmmvrattle.platforms import platform_and_properties
 from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain, rigid_waters
+from run_support import needs_opencl
 
 HEADINGS = [
     "Step",
@@ -103,6 +105,32 @@ def test_every_column_is_what_the_integrator_and_the_state_say() -> None:
         assert row["Constraint Error"] == pytest.approx(error, abs=1e-13)
         assert 0 < error < 1e-7
     assert len(read(output.getvalue())) == 3
+
+
+@needs_opencl
+def test_reports_on_a_device() -> None:
+    """On a platform by name: the columns are those of Reference, at the same times and at equal ones."""
+    rows = {}
+    for name in ("Reference", "OpenCL:double"):
+        waters, output = rigid_waters(4), io.StringIO()
+        simulation = app.Simulation(waters.topology, waters.system, our_integrator(), *platform_and_properties(name))
+        simulation.context.setPositions(waters.positions)
+        simulation.context.setVelocities(waters.velocities)
+        simulation.reporters.append(StepSizeReporter(output, 5))
+        simulation.step(10)
+        run_for_time(simulation, 0.02, every=0.01)
+        rows[name] = read(output.getvalue())
+        assert simulation.integrator.isOnDevice() == (name != "Reference")
+    expected, found = rows.values()
+    assert len(expected) == len(found) == 4
+    for one, other in zip(expected, found, strict=True):
+        assert list(other) == HEADINGS
+        assert other["Constraint Error"] < 1e-8
+        others = ("Constraint Error", "Solver Iterations per Step", "Energy Error (kJ/mole)")
+        same = [name for name in HEADINGS if name not in others]
+        # The forces of the two platforms differ by less than 1e-5, and their energies by a constant.
+        assert [other[name] for name in same] == pytest.approx([one[name] for name in same], rel=1e-3)
+        assert other["Energy Error (kJ/mole)"] == pytest.approx(one["Energy Error (kJ/mole)"], abs=2e-3)
 
 
 def test_a_report_does_not_disturb_the_run() -> None:

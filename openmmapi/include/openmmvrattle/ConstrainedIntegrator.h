@@ -72,6 +72,13 @@ public:
     /** Get how many iterations the solver of the constraints has taken since then, those of trial steps among them. */
     long long getNumSolverIterations() const;
     /**
+     * Tell whether the last step was taken by a GPU, on OpenCL, CUDA and HIP, and not on the host with forces from there, which is
+     * slow for large systems. The first step of a run always is the host's. What else is left to the host is in docs/gpu.md.
+     *
+     * @return true if by a GPU; false on Reference and CPU, and before the first step
+     */
+    bool isOnDevice() const;
+    /**
      * Set the relative tolerance of the constraints. Default: 1e-8.
      *
      * For a distance it is a fraction of that distance. For a constraint g = 0 of addConstraint() it is a fraction of 0.1 nm, about

@@ -160,6 +160,7 @@ template <class Host> void CommonRunDevice<Host>::step(double maxTime) {
         stepOnDevice(maxTime);
     else
         Host::step(maxTime);
+    hasStepped = isOnDevice;
     knownCount = vectors->getStepCount();
 }
 

@@ -45,6 +45,9 @@ public:
         return true;
     }
     long long getNumSolverIterations() override;
+    bool hasSteppedOnDevice() override {
+        return hasStepped;
+    }
     void save(RunState& run) override;
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
@@ -102,6 +105,7 @@ private:
     bool hasBegun;      // the device has what it needs for the next step
     bool isOnHost;      // the host's state is the same
     bool areSettingsOnDevice, hasReport;
+    bool hasStepped = false; // by the last step()
     int numAsked;       // steps since the last settle()
     int stepsUntilLook; // how many there may be
     double lastMaxTime; // of the last of them

@@ -39,6 +39,7 @@ from openmm import unit
 
 from .. import VariableStepRattleIntegrator
 from .._arguments import number
+from ..platforms import make_context
 from ..testsystems import MonitorSettings, StepControl, TestSystem
 
 __all__ = [
@@ -283,7 +284,7 @@ def advise(
         velocities: nm/ps or a Quantity; by default drawn at the temperature.
         step_size: the fixed step, ps or a Quantity.
         steps: the number of steps.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         temperature: of the velocities if none are given, K.
         seed: of these velocities.
         constraint_tolerance: relative tolerance of constrained distances.
@@ -314,7 +315,7 @@ def advise_on(
         start: a System with its start, which must meet the constraints.
         step_size: the fixed step, ps.
         steps: the number of steps.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         constraint_tolerance: relative tolerance of constrained distances.
         monitors: what to judge.
         bounds: the bounds to judge with each monitor.
@@ -466,7 +467,7 @@ def _run_trial(
     integrator.setConstraintTolerance(tolerance)
     try:
         start.prepare(integrator)
-        context = openmm.Context(start.system, integrator, openmm.Platform.getPlatformByName(platform))
+        context = make_context(start.system, integrator, platform)
         for name, value in start.parameters:
             context.setParameter(name, value)
         context.setPositions(start.positions)
@@ -507,7 +508,7 @@ def measured_gain(
     Args:
         advice: what to check.
         start: the system that it is about.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         automatic: whether to run the automatic step control, and not the best candidate of the advice.
 
     Returns:

@@ -161,7 +161,7 @@ def compare(
 
     Args:
         test_system: the system and its start.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         settings: what to run; by default the settings recommended for the system.
         progress: called while the runs go on.
         integrators: names out of `openmmvrattle.compare.measurement.INTEGRATORS`; by default those of

@@ -21,6 +21,7 @@ import openmm
 from openmm import app, unit
 
 from .._arguments import array
+from ..platforms import make_context, platform_and_properties, platform_names
 from ..testsystems import ComparisonSettings, MonitorSettings, StepControl, TestSystem, project_onto_constraints
 
 __all__ = ["CONSTRAINTS", "DEFAULT_FORCE_FIELD", "InputError", "from_pdb", "from_system", "from_xml"]
@@ -90,7 +91,7 @@ def from_pdb(
         options = {"nonbondedMethod": app.PME, "nonbondedCutoff": cutoff, "switchDistance": 0.9 * cutoff}
     try:
         if add_hydrogens:
-            model.addHydrogens(field)
+            model.addHydrogens(field, platform=platform_and_properties(_for_starts(platform))[0])
         model.addExtraParticles(field)
         system = field.createSystem(
             model.topology, constraints=CONSTRAINTS[constraints], rigidWater=True, removeCMMotion=False, **options
@@ -238,7 +239,7 @@ def _started(
     integrator = openmm.LangevinMiddleIntegrator(temperature * unit.kelvin, 10.0 / unit.picosecond, 0.001)
     integrator.setRandomNumberSeed(seed)
     integrator.setConstraintTolerance(1e-8)
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+    context = make_context(system, integrator, _for_starts(platform))
     # Those of Forces that were left out are of no use any more.
     known = set(context.getParameters())
     start = replace(start, parameters=tuple(pair for pair in start.parameters if pair[0] in known))
@@ -265,6 +266,12 @@ def _started(
     if system.getNumConstraints() <= MOST_CONSTRAINTS_OF_DENSE_PROJECTION and not has_virtual_sites:
         positions, velocities = project_onto_constraints(system, positions, velocities)
     return replace(start, positions=positions, velocities=velocities)
+
+
+def _for_starts(platform: str) -> str:
+    """Where a start is prepared: not with OpenCL, for under PoCL 3.1, a driver for processors, OpenMM's minimizer
+    crashes, and its constraint solver is inexact."""
+    return ("CPU" if "CPU" in platform_names() else "Reference") if platform.startswith("OpenCL") else platform
 
 
 def _energy_conserving(system: openmm.System) -> tuple[openmm.System, list[str]]:

@@ -21,6 +21,7 @@ from openmm import unit
 from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
 
 from .._constraint_errors import ConstraintErrors
+from ..platforms import make_context
 from ..testsystems import ComparisonSettings, StepControl, TestSystem
 
 __all__ = [
@@ -259,7 +260,7 @@ def run_method(
     Args:
         method: what to run.
         test_system: the system and its start.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         settings: simulated time and number of force evaluations.
         progress: called while the run goes on.
     """
@@ -289,7 +290,7 @@ def run_to_accuracy(
     Args:
         method: what to run.
         test_system: the system and its start.
-        platform: name of the OpenMM platform.
+        platform: name of the OpenMM platform, as for `openmmvrattle.platforms`.
         settings: simulated time, and the number of evaluations to begin with.
         wanted_error: kJ/mol.
         most_evaluations: the largest number that is tried; by default 20 times that of the settings.
@@ -549,7 +550,7 @@ def _start(
         integrator = method.make(parameter)
         integrator.setConstraintTolerance(settings.constraint_tolerance)
         test_system.prepare(integrator)
-        context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName(platform))
+        context = make_context(test_system.system, integrator, platform)
         for name, value in test_system.parameters:
             context.setParameter(name, value)
         context.setPositions(test_system.positions)
@@ -615,7 +616,7 @@ def _energy(test_system: TestSystem, context: openmm.Context) -> float:
 def initial_energy(test_system: TestSystem, platform: str) -> float:
     """The energy at the start, in kJ/mol, from the velocities as they are."""
     integrator = openmm.VerletIntegrator(1e-6)
-    context = openmm.Context(test_system.system, integrator, openmm.Platform.getPlatformByName(platform))
+    context = make_context(test_system.system, integrator, platform)
     for name, value in test_system.parameters:
         context.setParameter(name, value)
     context.setPositions(test_system.positions)

@@ -12,9 +12,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import openmm
-
 from ...custom.settings import MONITOR_KINDS as MONITORS
+from ...platforms import add_platform_arguments, platform_from, platform_names
 from ...testsystems import SYSTEMS, MonitorSettings, TestSystem
 from ..inputs import CONSTRAINTS, DEFAULT_FORCE_FIELD, InputError, from_pdb, from_xml
 
@@ -59,11 +58,7 @@ def add_system_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="of the velocities at the start, where there are none (default: 300)",
     )
-    parser.add_argument(
-        "--platform",
-        metavar="NAME",
-        help=f"OpenMM platform (default: Reference; for your own systems of more than {_LARGE} particles CPU)",
-    )
+    add_platform_arguments(parser, f"Reference; for your own systems of more than {_LARGE} particles CPU")
 
 
 def chosen(name: str, names: Iterable[str], what: str) -> str:
@@ -114,7 +109,7 @@ def own_system(options: argparse.Namespace, seed: int) -> tuple[TestSystem, str]
 
 
 def _fast_platform() -> str:
-    return "CPU" if "CPU" in platforms() else "Reference"
+    return "CPU" if "CPU" in platform_names() else "Reference"
 
 
 def named_system(name: str, seed: int | None) -> TestSystem:
@@ -128,15 +123,17 @@ def has_seed(name: str) -> bool:
     return "seed" in inspect.signature(SYSTEMS[name]).parameters
 
 
-def platforms() -> list[str]:
-    """The names of OpenMM's platforms here."""
-    return [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
-
-
 def check_platform(options: argparse.Namespace) -> None:
-    """Write the platform as OpenMM does, or raise a UsageError."""
+    """Write the platform as OpenMM does, with the precision that it is to have, or raise a UsageError."""
     if options.platform is not None:
-        options.platform = chosen(options.platform, platforms(), "platform")
+        options.platform = chosen(options.platform, platform_names(), "platform")
+    if options.precision is not None:
+        if options.platform is None:
+            raise UsageError("--precision needs the platform that it is for: give --platform NAME as well.")
+        try:
+            options.platform = platform_from(options, options.platform)
+        except ValueError as error:
+            raise UsageError(f"{error}.") from error
 
 
 def monitors_from(text: str) -> tuple[MonitorSettings, ...]:
