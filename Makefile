@@ -22,7 +22,7 @@ PYTHON_REPORT ?= $(abspath $(BUILD))/python-tests.xml
 comma := ,
 CXX_FILES = $(shell find openmmapi method platforms serialization tests examples -name '*.h' -o -name '*.cpp' 2>/dev/null)
 
-.PHONY: all demo test check-format cxx-test sanitize sanitize-threads scaling python-test claims docs proof pictures wheel sdist conda install format clean
+.PHONY: all demo test check-format cxx-test sanitize sanitize-threads scaling python-test claims docs proof pictures wheel sdist conda check-workflow install format clean
 
 all: test
 
@@ -88,9 +88,9 @@ docs: install $(DOCS_TOOLS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "The documentation is in docs/_build/html/index.html."
 
-# A protein in water at constant energy beside VerletIntegrator: the table and the figure of docs/proof.md. The 100 ps take an hour or
-# more on two cores; PROOF_ARGUMENTS="--time 10", for example, less, and "--platform CUDA" has a place of its own on the page.
-PROOF_ARGUMENTS ?=
+# A protein in water at constant energy beside VerletIntegrator: the first table and figure of docs/proof.md, 100 ps of a helix in less
+# than an hour. PROOF_ARGUMENTS="--time 10", for example, is the whole protein, and "--platform CUDA" has a place of its own on the page.
+PROOF_ARGUMENTS ?= --system villin-helix --threads 1
 proof: install
 	$(BIN)/python benchmarks/proof.py --page $(PROOF_ARGUMENTS)
 
@@ -108,14 +108,17 @@ define test_package
 	venv/bin/python -m pytest -p no:cacheprovider "$(2)/python/tests" $(PYTEST_ARGUMENTS)
 endef
 
-# A wheel in dist, without OpenMM's libraries: they are those of the package openmm beside it. auditwheel names it by the
-# oldest C library that it runs with.
+# A wheel in dist for PYTHON, whatever the Python of .venv is, without OpenMM's libraries: they are those of the package
+# openmm beside it. auditwheel names it by the oldest C library that it runs with.
+wheel: TAG = $(shell $(PYTHON) -c "import sys; print('cp%d%d' % sys.version_info[:2])")
 wheel: $(PACKAGE_TOOLS)
-	rm -rf dist/*.whl $(BUILD)/wheel
-	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BIN)/python -m build --wheel --outdir $(BUILD)/wheel .
+	rm -rf dist/*-$(TAG)-*.whl $(BUILD)/wheel-$(TAG)
+	$(PYTHON) -m venv $(BUILD)/wheel-$(TAG)/venv
+	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(BUILD)/wheel-$(TAG)/venv/bin/python -m pip wheel --quiet --no-deps \
+		--wheel-dir $(BUILD)/wheel-$(TAG) .
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --exclude libOpenMM.so --exclude libOpenMMOpenCL.so \
-		--exclude libOpenMMCUDA.so --exclude libOpenMMHIP.so --wheel-dir dist $(BUILD)/wheel/*.whl
-	$(call test_package,$(CURDIR)/dist/*.whl,$(CURDIR))
+		--exclude libOpenMMCUDA.so --exclude libOpenMMHIP.so --wheel-dir dist $(BUILD)/wheel-$(TAG)/*.whl
+	$(call test_package,$(CURDIR)/dist/*-$(TAG)-*.whl,$(CURDIR))
 
 # The sources in dist, from which a build is made and tested with the tests that are in the archive.
 sdist: $(PACKAGE_TOOLS)
@@ -124,6 +127,11 @@ sdist: $(PACKAGE_TOOLS)
 	mkdir -p $(BUILD)/sdist
 	tar -xzf dist/*.tar.gz -C $(BUILD)/sdist --strip-components 1
 	$(call test_package,$(CURDIR)/$(BUILD)/sdist,$(CURDIR)/$(BUILD)/sdist)
+
+# Is the hosted workflow well-formed? With the actionlint that is here, or else with Go, which fetches it.
+ACTIONLINT ?= $(shell command -v actionlint || echo "go run github.com/rhysd/actionlint/cmd/actionlint@v1.7.12")
+check-workflow:
+	$(ACTIONLINT) .github/workflows/*.yml
 
 # The recipe for conda as it would be built.
 conda: $(PACKAGE_TOOLS)

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import openmmvrattle
@@ -79,3 +81,45 @@ def test_tests_have_what_comparisons_need() -> None:
     extra = requirements(r"project\.optional-dependencies", "compare")
     assert set(extra) == {"matplotlib-base", "rich", "distributed"}
     assert extra.items() <= requirements(r"project\.optional-dependencies", "test").items()
+
+
+@pytest.fixture(scope="module")
+def workflow() -> dict:
+    path = ROOT / ".github" / "workflows" / "test.yml"
+    if not path.exists():
+        pytest.skip("the source archive has no hosted workflow")
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def test_the_hosted_workflow_runs_what_is_run_here(workflow: dict) -> None:
+    """Nothing but `.ci/run` and targets of make that there are, each job at least one of them."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
+    for name, job in workflow["jobs"].items():
+        commands = [step["run"] for step in job["steps"] if "run" in step]
+        known = 0
+        for command in commands:
+            target = re.match(r"make (\S+|\$\{\{ matrix\.target \}\})", command)
+            if target and target[1].startswith("$"):
+                assert set(job["strategy"]["matrix"]["target"]) <= targets
+            elif target:
+                assert target[1] in targets
+            known += bool(target) or command == "bash .ci/run"
+        assert known > 0, f"the job {name} runs nothing of ours"
+
+
+def test_the_hosted_workflow_has_all_pythons(workflow: dict) -> None:
+    oldest = re.search(r'requires-python = ">=3\.(\d+)"', section("project"))[1]
+    for job in ("test", "wheels"):
+        versions = workflow["jobs"][job]["strategy"]["matrix"]["python"]
+        assert versions == [f"3.{minor}" for minor in range(int(oldest), 14)]
+
+
+def test_the_hosted_workflow_is_well_formed(workflow: dict) -> None:
+    """As `make check-workflow` has it, which fetches actionlint where it is not."""
+    actionlint = shutil.which("actionlint") or shutil.which("actionlint", path=Path.home() / "go" / "bin")
+    if actionlint is None:
+        pytest.skip("needs actionlint")
+    files = (ROOT / ".github" / "workflows").glob("*.yml")
+    result = subprocess.run([actionlint, *files], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
