@@ -9,14 +9,15 @@ both alike. In the middle each run is stopped, saved as a checkpoint, and goes o
 is made anew. Measured are the wall time, the drift and the fluctuation of the total energy, the largest error of a
 constraint, and the energy before and after the restart.
 
-The systems: `villin`, the headpiece of 36 residues in water with 8,867 atoms that comes with OpenMM, and
-`alanine-dipeptide` in a box of 2.5 nm; both with rigid water, rigid bonds to hydrogen, and PME.
+The systems: `villin`, the headpiece of 35 residues in water with 8,867 atoms that comes with OpenMM; `villin-helix`,
+its last helix of 14 residues in a small box of water; and `alanine-dipeptide` in a box of 2.5 nm. All have rigid water,
+rigid bonds to hydrogen, and PME.
 
 A run takes an hour or more. Every half minute it is saved in the folder ``--output``; the same command with
 ``--resume`` goes on with what is there, for example after the machine was needed for something else.
 
 Prints a table, and writes proof.json, proof.csv with the energies, and proof.png to the folder ``--output``; with
-``--page`` it puts table and figure into docs/proof.md as well.
+``--page`` it puts table and figure into docs/proof.md as well, where that has a place for the system and the platform.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import base64
 import csv
 import json
 import math
+import random
 import shutil
 import statistics
 import sys
@@ -61,6 +63,22 @@ def villin() -> app.Modeller:
     return app.Modeller(file.topology, file.positions)
 
 
+def helix() -> app.Modeller:
+    """The last 14 residues of the same protein, a helix, in a dodecahedron of water, neutral."""
+    modeller = villin()
+    residues = [residue for residue in modeller.topology.residues() if residue.name not in ("HOH", "Cl")]
+    kept = residues[-14:]
+    modeller.delete([residue for residue in modeller.topology.residues() if residue not in kept])
+    # What was in the middle of the chain becomes its end.
+    first = next(modeller.topology.residues())
+    modeller.delete([atom for atom in first.atoms() if atom.name == "H"])
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    modeller.addHydrogens(field, platform=openmm.Platform.getPlatformByName("Reference"))
+    random.seed(1)  # Modeller draws the places of the ions from it
+    modeller.addSolvent(field, padding=1.0 * unit.nanometer, boxShape="dodecahedron")
+    return modeller
+
+
 def dipeptide() -> app.Modeller:
     """Alanine dipeptide in a box of water with edges of 2.5 nm."""
     molecule = alanine_dipeptide(constraints=app.HBonds)
@@ -70,7 +88,7 @@ def dipeptide() -> app.Modeller:
     return modeller
 
 
-SYSTEMS = {"villin": villin, "alanine-dipeptide": dipeptide}
+SYSTEMS = {"villin": villin, "villin-helix": helix, "alanine-dipeptide": dipeptide}
 
 
 def create_system(topology: app.Topology) -> openmm.System:
@@ -427,7 +445,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     draw(problem, runs).savefig(options.output / "proof.png")
     unfinished.path.unlink(missing_ok=True)
     if options.page:
-        name = "proof" if options.platform == "CPU" else f"proof-{options.platform.lower()}"
+        # The platform CPU is the one that everybody has.
+        name = "-".join(["proof", options.system] + [options.platform.lower()] * (options.platform != "CPU"))
         shutil.copy(options.output / "proof.png", pages.DOCS / "images" / f"{name}.png")
         pages.write(pages.DOCS / "proof.md", name, [*lines, "", f"![Total energy of both runs](images/{name}.png)"])
     return 0

@@ -27,7 +27,7 @@ def test_a_short_run(proof: ModuleType, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(proof.pages, "DOCS", tmp_path)
     (tmp_path / "images").mkdir()
     page = tmp_path / "proof.md"
-    page.write_text("<!-- measured: proof -->\n<!-- end: proof -->\n")
+    page.write_text("<!-- measured: proof-alanine-dipeptide -->\n<!-- end: proof-alanine-dipeptide -->\n")
     arguments = ["--system", "alanine-dipeptide", "--time", "0.32", "--relaxation", "0.02", "--output", str(tmp_path)]
     monkeypatch.setattr(proof, "SAVE_EVERY", 0.0)
     save = proof.Unfinished.save
@@ -62,8 +62,11 @@ def test_a_short_run(proof: ModuleType, tmp_path: Path, monkeypatch: pytest.Monk
     assert energies[:16] == pytest.approx(begun["runs"][1]["energies"], abs=1e-6)
     assert np.ptp(energies[4:]) < 20  # went on where it had stopped: another start differs by hundreds
     text = page.read_text()
-    assert "drift of the total energy" in text and "![Total energy of both runs](images/proof.png)" in text
-    assert (tmp_path / "images" / "proof.png").read_bytes().startswith(b"\x89PNG")
+    assert (
+        "drift of the total energy" in text
+        and "![Total energy of both runs](images/proof-alanine-dipeptide.png)" in text
+    )
+    assert (tmp_path / "images" / "proof-alanine-dipeptide.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_run_that_is_too_short_is_refused(proof: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:

@@ -207,6 +207,35 @@ def test_an_example_to_begin_with_has_the_recipe(name: str) -> None:
     assert re.match(r"integrator = VariableStepRattleIntegrator\(0\.\d+, automatic=True\)  #", first)
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/**/*.md")), ids=name_of)
+def test_a_page_begins_with_whom_it_is_for(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    if "{include}" not in text[:250] and "_build" not in page.parts:  # README and changelog
+        assert re.search(r"^# .*\n\nFor (all|every|those|machines) ?", text, re.MULTILINE)
+
+
+def test_the_path_of_a_new_user_is_eight_short_pages() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    pages = re.search(r":caption: Use\n.*?\n\n(.*?)\n```", index, re.DOTALL)[1].split()
+    assert len(pages) <= 8
+    for page in pages:
+        assert len((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").splitlines()) <= 130
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/*.md")), ids=name_of)
+def test_a_measured_table_says_where_it_is_from(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(r"<!-- measured: (\S+) -->\n(.*?)<!-- end: (\S+) -->", text, re.DOTALL)
+    assert len(re.findall(r"^<!-- measured: ", text, re.MULTILINE)) == len(blocks)
+    for name, block, end in blocks:
+        assert name == end
+        if block.strip():  # nobody has measured it yet
+            origin = r"\n\*(?:Written by|Pasted from the output of) `python (benchmarks/\w+\.py)[^`]*` o"
+            script = re.match(origin, block)
+            assert script, f"the table {name} does not say where it is from"
+            assert (ROOT / script[1]).exists()
+
+
 @pytest.mark.parametrize("picture", sorted(ROOT.glob("docs/images/*.png")), ids=name_of)
 def test_a_picture_is_small_and_shown(picture: Path) -> None:
     assert picture.stat().st_size < 200_000
