@@ -120,12 +120,13 @@ wheel: $(PACKAGE_TOOLS)
 		--exclude libOpenMMCUDA.so --exclude libOpenMMHIP.so --wheel-dir dist $(BUILD)/wheel-$(TAG)/*.whl
 	$(call test_package,$(CURDIR)/dist/*-$(TAG)-*.whl,$(CURDIR))
 
-# The sources in dist, from which a build is made and tested with the tests that are in the archive.
+# All sources in dist, from which a build is made and tested with the tests that are in the archive.
 sdist: $(PACKAGE_TOOLS)
 	rm -rf dist/*.tar.gz $(BUILD)/sdist
 	$(BIN)/python -m build --sdist --outdir dist .
 	mkdir -p $(BUILD)/sdist
 	tar -xzf dist/*.tar.gz -C $(BUILD)/sdist --strip-components 1
+	git ls-files | (cd $(BUILD)/sdist && xargs -r ls -d) > /dev/null # it is complete
 	$(call test_package,$(CURDIR)/$(BUILD)/sdist,$(CURDIR)/$(BUILD)/sdist)
 
 # Is the hosted workflow well-formed? With the actionlint that is here, or else with Go, which fetches it.
