@@ -207,6 +207,20 @@ def test_an_example_to_begin_with_has_the_recipe(name: str) -> None:
     assert re.match(r"integrator = VariableStepRattleIntegrator\(0\.\d+, automatic=True\)  #", first)
 
 
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/development.md"])
+def test_files_that_the_recipes_name_are_there(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    names = re.findall(
+        r"(?<![\w/])((?:[\w.]+/)+[\w.]*|\w+\.(?:h|cpp|py))(?![\w/])", " ".join(re.findall(r"`([^`\n]+)`", text))
+    )
+    assert len(set(names)) > 10
+    for name in set(names):
+        found = [ROOT, ROOT / "python", ROOT / "python" / "openmmvrattle", ROOT / "method"]
+        made = name.startswith((".venv", "build", "dist", "docs/_build", "out"))
+        here = any((folder / name).exists() for folder in found)
+        assert made or here or "/" not in name and any(ROOT.glob(f"[!.b]*/**/{name}")), name
+
+
 @pytest.mark.parametrize("page", sorted(ROOT.glob("docs/**/*.md")), ids=name_of)
 def test_a_page_begins_with_whom_it_is_for(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
