@@ -356,6 +356,7 @@ def draw_monitors() -> Figure:
     left.axhspan(left.get_ylim()[0], 2.5, color="0.92", zorder=0)
     left.axvline(times[integrator.getCalibrationSteps() - 1], color="0.6", linewidth=0.8, linestyle="--")
     left.set(xlabel="time (ps)", title="two N2 that collide at 5 km/s")
+    left.set_ylim(top=80)  # room for the legend
     left.legend(fontsize=8, loc="upper left")
     u = np.geomspace(0.1, 10, 300)
     right.loglog(u, (1 + np.maximum(0, (u / 2.5) ** 4 - 0.8**4) ** 4) ** (1 / 16), color="k")
