@@ -121,7 +121,6 @@ RELEASES_GIL(VariableStepRattleLangevinIntegrator, getMonitorValue)
 %ignore OpenMMVRattle::VariableStepRattleLangevinIntegrator::VariableStepRattleLangevinIntegrator(
     const VariableStepRattleLangevinIntegrator&);
 
-#define OPENMMVRATTLE_EXPORT
 %nodefaultctor OpenMMVRattle::ConstrainedIntegrator;
 %include "openmmvrattle/ConstrainedIntegrator.h"
 %include "openmmvrattle/VariableStepRattleIntegrator.h"

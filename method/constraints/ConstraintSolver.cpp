@@ -385,14 +385,25 @@ void ConstraintSolver::moveTo(const Vectors& positions, const ExpressionParamete
 void ConstraintSolver::ensureFactor(FactorScope scope) {
     if (factorScope >= scope)
         return;
-    Part part = ConstraintSystem::ALL;
-    if (scope == GeneralFactor)
-        part.first = system.getFirstGeneral();
-    system.evaluateJacobian(*q, *theta, jacobian, part);
-    const int failed = matrix.tryToFactorize(jacobian, part);
-    if (failed != ConstraintMatrix::REGULAR)
-        matrix.throwDependent(failed, jacobian);
-    system.multiplyOverMass(jacobian, *force, appliedTerm, part);
+    auto form = [&](const Part& part) {
+        system.evaluateJacobian(*q, *theta, jacobian, part);
+        system.multiplyOverMass(jacobian, *force, appliedTerm, part);
+    };
+    auto factorize = [&](const Part& part, Result& share) {
+        form(part);
+        share.addFailed(matrix.tryToFactorize(jacobian, part));
+    };
+    work.runOnJoints([&](const CutCluster& cluster) { form(cluster.joints); }); // which are in the columns of pieces
+    Result result =
+        work.run([](int) {}, [](const ClusterBatch&, int, int, Result&) {}, [](int) {}, factorize, factorize);
+    if (scope == FullFactor && system.getFirstGeneral() > 0)
+        factorize(system.getWholeParts()[0], result);
+    work.runOnJoints([&](const CutCluster& cluster) {
+        if (result.failed == ConstraintMatrix::REGULAR)
+            result.addFailed(matrix.tryToFactorizeJoints(jacobian, cluster));
+    });
+    if (result.failed != ConstraintMatrix::REGULAR)
+        matrix.throwDependent(result.failed, jacobian);
     factorScope = scope;
 }
 

@@ -45,15 +45,13 @@ void AutomaticControl::findSquares(const State& state, vector<double>& squares) 
     const vector<Vec3>& netForces =
         clusterForces.findNetForces(state.positions, state.parameters, state.forces, state.multipliers);
     const vector<double>&masses = system.getMasses(), &inverseMasses = system.getInverseMasses();
-    clusterForces.forClusters([&](int c, const int* first, const int* end) {
-        double sum = 0;
-        for (const int* i = first; i < end; i++) {
-            const double speedSquared = state.velocities[*i].dot(state.velocities[*i]);
-            sum += netForces[*i].dot(netForces[*i]) * inverseMasses[*i] +
-                   masses[*i] * speedSquared * speedSquared / (FLIGHT * FLIGHT);
-        }
-        squares[c] = sum;
-    });
+    clusterForces.sumOverClusters(
+        [&](int i) {
+            const double speedSquared = state.velocities[i].dot(state.velocities[i]);
+            return netForces[i].dot(netForces[i]) * inverseMasses[i] +
+                   masses[i] * speedSquared * speedSquared / (FLIGHT * FLIGHT);
+        },
+        squares);
     const vector<int>& moving = solver.getMovingParticles();
     temperature = solver.sum((int) moving.size(), [&](int p) {
         return masses[moving[p]] * state.velocities[moving[p]].dot(state.velocities[moving[p]]) / numDegreesOfFreedom;
@@ -62,13 +60,15 @@ void AutomaticControl::findSquares(const State& state, vector<double>& squares) 
 
 // U_A from S_c
 double AutomaticControl::evaluateOnStep(const State& state, const vector<double>& squares) {
-    clusterForces.forClusters([&](int c, const int* first, const int* end) {
-        double sum = squares[c];
-        for (const int* i = first; i < end; i++) {
-            const Vec3 &force = state.forces[*i], &v = state.velocities[*i];
-            sum += std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
-        }
-        scratch[c] = sum;
+    clusterForces.sumOverClusters(
+        [&](int i) {
+            const Vec3 &force = state.forces[i], &v = state.velocities[i];
+            return std::sqrt(force.dot(force)) * v.dot(v) / LENGTH;
+        },
+        scratch);
+    solver.share((int) scratch.size(), [&](int first, int end) {
+        for (int c = first; c < end; c++)
+            scratch[c] += squares[c];
     });
     return clusterForces.eighthRootOfFourthPowers(scratch);
 }
@@ -83,11 +83,11 @@ void AutomaticControl::measure(const State& state, const vector<Vec3>& w, double
     findSquares(state, measuredSquares);
     measured[OnStep] = evaluateOnStep(state, measuredSquares);
     requireFinite(measured[OnStep], "U_A");
-    clusterForces.forClusters([&](int c, const int* first, const int* end) {
-        double work = 0;
-        for (const int* i = first; i < end; i++)
-            work += w[*i].dot(state.forces[*i] - oldForce[*i]);
-        scratch[c] = CHANGE_WEIGHT / size * std::fabs(work) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
+    clusterForces.sumOverClusters([&](int i) { return w[i].dot(state.forces[i] - oldForce[i]); }, scratch);
+    solver.share((int) scratch.size(), [&](int first, int end) {
+        for (int c = first; c < end; c++)
+            scratch[c] =
+                CHANGE_WEIGHT / size * std::fabs(scratch[c]) + 0.5 * (measuredSquares[c] + memory.forceSquares[c]);
     });
     measured[HalfStep] = clusterForces.eighthRootOfFourthPowers(scratch);
     requireFinite(measured[HalfStep], "U_B");

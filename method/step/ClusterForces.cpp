@@ -17,19 +17,18 @@ ClusterForces::ClusterForces(ConstraintSolver& solver) :
     for (int c = 0; c < numClusters; c++)
         for (int i : system.getClusterParticles(c))
             clusters[i] = c;
-    for (int i : solver.getMovingParticles()) {
+    for (int i : solver.getMovingParticles())
         if (clusters[i] < 0)
             clusters[i] = numClusters++;
-        clusterOfParticle.push_back(clusters[i]);
-    }
     firstParticles.assign(numClusters + 1, 0);
-    for (int c : clusterOfParticle)
-        firstParticles[c + 1]++;
+    for (int i : solver.getMovingParticles())
+        firstParticles[clusters[i] + 1]++;
     std::partial_sum(firstParticles.begin(), firstParticles.end(), firstParticles.begin());
-    particles.resize(clusterOfParticle.size() + 1); // one more, so that the end of all has an address
+    particles.resize(solver.getMovingParticles().size());
     vector<int> place = firstParticles;
-    for (size_t p = 0; p < clusterOfParticle.size(); p++)
-        particles[place[clusterOfParticle[p]]++] = solver.getMovingParticles()[p];
+    for (int i : solver.getMovingParticles())
+        particles[place[clusters[i]]++] = i;
+    heads.resize(SharedWork::getNumRanges((int) particles.size()));
     netForces.resize(system.getNumParticles());
 }
 
@@ -44,17 +43,15 @@ const vector<Vec3>& ClusterForces::findNetForces(const vector<Vec3>& positions, 
 
 std::string ClusterForces::describe(int cluster) const {
     const size_t maxListed = 4;
-    vector<int> particles;
-    for (size_t p = 0; p < clusterOfParticle.size(); p++)
-        if (clusterOfParticle[p] == cluster)
-            particles.push_back(solver.getMovingParticles()[p]);
-    if (particles.size() == 1)
-        return "particle " + std::to_string(particles[0]);
+    const vector<int> members(particles.begin() + firstParticles[cluster],
+                              particles.begin() + firstParticles[cluster + 1]);
+    if (members.size() == 1)
+        return "particle " + std::to_string(members[0]);
     std::string text = "the cluster of the particles ";
-    for (size_t i = 0; i < particles.size() && i < maxListed; i++)
-        text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
-    if (particles.size() > maxListed)
-        text += ", ... (" + std::to_string(particles.size()) + " in all)";
+    for (size_t i = 0; i < members.size() && i < maxListed; i++)
+        text += (i == 0 ? "" : i + 1 == members.size() ? " and " : ", ") + std::to_string(members[i]);
+    if (members.size() > maxListed)
+        text += ", ... (" + std::to_string(members.size()) + " in all)";
     return text;
 }
 

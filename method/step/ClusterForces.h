@@ -6,6 +6,7 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
+#include <algorithm>
 #include <string>
 #include <vector>
 
@@ -21,16 +22,27 @@ public:
     int getNumClusters() const {
         return numClusters;
     }
-    /** The cluster of each of the solver's moving particles, in their order. */
-    const std::vector<int>& getClusters() const {
-        return clusterOfParticle;
-    }
-    /** Go through the clusters, on several threads where that is faster: task(cluster, its first moving particle, the end of these). */
-    template <class Task> void forClusters(const Task& task) const {
-        solver.share(numClusters, [&](int first, int end) {
-            for (int c = first; c < end; c++)
-                task(c, &particles[firstParticles[c]], &particles[firstParticles[c + 1]]);
+    /**
+     * sums[c], the sum of term(i) over the particles i of each cluster c, on several threads where that is faster. Threads share the
+     * particles, cluster after cluster, so that a large one is as good as many small ones.
+     */
+    template <class Term> void sumOverClusters(const Term& term, std::vector<double>& sums) {
+        const int count = (int) particles.size();
+        solver.share(count, [&](int first, int end) {
+            int cluster = findClusterAt(first);
+            for (int p = first; p < end; cluster++) {
+                double sum = 0;
+                for (const int last = std::min(end, firstParticles[cluster + 1]); p < last; p++)
+                    sum += term(particles[p]);
+                (firstParticles[cluster] < first ? heads[first / SharedWork::RANGE_SIZE] : sums[cluster]) = sum;
+            }
         });
+        // What a range has of a cluster that begins before it.
+        for (int first = SharedWork::RANGE_SIZE; first < count; first += SharedWork::RANGE_SIZE) {
+            const int cluster = findClusterAt(first);
+            if (firstParticles[cluster] < first)
+                sums[cluster] += heads[first / SharedWork::RANGE_SIZE];
+        }
     }
     /** N, valid until the next call. */
     const std::vector<OpenMM::Vec3>& findNetForces(const std::vector<OpenMM::Vec3>& positions,
@@ -43,10 +55,15 @@ public:
     double eighthRootOfFourthPowers(const std::vector<double>& x) const;
 
 private:
+    int findClusterAt(int place) const {
+        return (int) (std::upper_bound(firstParticles.begin(), firstParticles.end(), place) - firstParticles.begin()) -
+               1;
+    }
     ConstraintSolver& solver;
-    std::vector<int> clusterOfParticle;
     int numClusters;
-    std::vector<int> firstParticles, particles; // of each cluster; one more than there are, which is the end of all
+    std::vector<int> particles;      // that move, cluster after cluster
+    std::vector<int> firstParticles; // of each cluster, by places; and the end of all
+    std::vector<double> heads;       // of each range
     std::vector<OpenMM::Vec3> netForces;
 };
 

@@ -48,12 +48,10 @@ LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<Di
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     noForce.resize(getConstraintSystem().getNumParticles());
-    particleShares.resize(solver.getMovingParticles().size());
     theta = thetaNow = thetaMiddle = thetaNext = getConstraintSystem().getGivenParameters();
     target = parameterChange = theta.values;
     clusterSums.resize(clusterForces.getNumClusters());
-    for (int cluster : clusterForces.getClusters())
-        clusterSums[cluster] += 1;
+    clusterForces.sumOverClusters([](int) { return 1.0; }, clusterSums);
     systemSize = clusterForces.eighthRootOfFourthPowers(clusterSums);
 }
 
@@ -126,18 +124,13 @@ double LangevinDynamics::evaluateMonitor(const Vectors& positions, const Express
                                          const Vectors& velocities, const Vectors& forces,
                                          const vector<double>& multipliers) {
     const Vectors& netForces = clusterForces.findNetForces(positions, parameters, forces, multipliers);
-    const vector<int>& particles = solver.getMovingParticles();
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
-    solver.share((int) particles.size(), [&](int first, int end) {
-        for (int p = first; p < end; p++) {
-            const int i = particles[p];
+    clusterForces.sumOverClusters(
+        [&](int i) {
             const double square = netForces[i].dot(netForces[i]), speedSquared = velocities[i].dot(velocities[i]);
-            particleShares[p] = square * inverseMasses[i] + std::sqrt(square) * speedSquared * (1 / FLIGHT_LENGTH);
-        }
-    });
-    std::fill(clusterSums.begin(), clusterSums.end(), 0.0);
-    for (size_t p = 0; p < particles.size(); p++)
-        clusterSums[clusterForces.getClusters()[p]] += particleShares[p];
+            return square * inverseMasses[i] + std::sqrt(square) * speedSquared * (1 / FLIGHT_LENGTH);
+        },
+        clusterSums);
     return clusterForces.eighthRootOfFourthPowers(clusterSums);
 }
 

@@ -205,7 +205,7 @@ private:
     ExpressionParameters thetaNow, thetaMiddle, thetaNext;
     std::vector<double> parameterChange; // theta[n+1] - theta[n]
     std::vector<double> lambdaNow, lambdaNext, multipliers, noMultipliers, rightSide;
-    std::vector<double> particleShares, clusterSums; // of A_c, and A_c
+    std::vector<double> clusterSums; // A_c
     double systemSize;                   // S
 };
 

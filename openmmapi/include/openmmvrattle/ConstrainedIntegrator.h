@@ -7,7 +7,6 @@
 #include "openmm/Integrator.h"
 #include "openmm/Kernel.h"
 #include "openmm/internal/OSRngSeed.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 #include <iosfwd>
 #include <map>
 #include <memory>
@@ -27,7 +26,7 @@ struct RunState;
  * their multipliers, counts of the work, and that all they need to go on is in checkpoints and States. Use
  * VariableStepRattleIntegrator or VariableStepRattleLangevinIntegrator.
  */
-class OPENMMVRATTLE_EXPORT ConstrainedIntegrator : public OpenMM::Integrator {
+class ConstrainedIntegrator : public OpenMM::Integrator {
 public:
     ~ConstrainedIntegrator() override;
     /**

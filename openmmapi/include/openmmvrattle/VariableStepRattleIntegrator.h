@@ -5,7 +5,6 @@
 #define OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATOR_H_
 
 #include "openmmvrattle/ConstrainedIntegrator.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 #include <string>
 
 namespace OpenMMVRattle {
@@ -57,7 +56,7 @@ namespace OpenMMVRattle {
  * of their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter
  * of OpenMM's RPMDIntegrator, which takes the place of this one.
  */
-class OPENMMVRATTLE_EXPORT VariableStepRattleIntegrator : public ConstrainedIntegrator {
+class VariableStepRattleIntegrator : public ConstrainedIntegrator {
 public:
     /** The recursion that gives the next step density from the last one. All are symmetric in time. */
     enum UpdateMethod {

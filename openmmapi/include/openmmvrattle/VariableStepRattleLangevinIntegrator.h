@@ -5,7 +5,6 @@
 #define OPENMMVRATTLE_VARIABLESTEPRATTLELANGEVININTEGRATOR_H_
 
 #include "openmmvrattle/ConstrainedIntegrator.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 
 namespace OpenMMVRattle {
 
@@ -46,7 +45,7 @@ namespace OpenMMVRattle {
  * platform. So do States made with integrator parameters, but for the random seed: several runs that go on from one State each have
  * the noise of their own integrator.
  */
-class OPENMMVRATTLE_EXPORT VariableStepRattleLangevinIntegrator : public ConstrainedIntegrator {
+class VariableStepRattleLangevinIntegrator : public ConstrainedIntegrator {
 public:
     /**
      * Create a VariableStepRattleLangevinIntegrator.

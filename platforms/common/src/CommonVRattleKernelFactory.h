@@ -9,7 +9,6 @@
 #include "openmm/KernelFactory.h"
 #include "openmm/OpenMMException.h"
 #include "openmmvrattle/VRattleKernels.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 #include "run/IntegratorSettings.h"
 #include <memory>
 #include <string>

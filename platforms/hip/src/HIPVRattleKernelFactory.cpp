@@ -4,9 +4,9 @@
 #include "CommonVRattleKernelFactory.h"
 #include "openmm/hip/HipPlatform.h"
 
-extern "C" OPENMMVRATTLE_EXPORT void registerPlatforms() {
+extern "C" void registerPlatforms() {
 }
 
-extern "C" OPENMMVRATTLE_EXPORT void registerKernelFactories() {
+extern "C" void registerKernelFactories() {
     OpenMMVRattle::registerFactories<OpenMM::HipPlatform>("HIP");
 }

@@ -14,11 +14,11 @@ using OpenMM::OpenMMException;
 using OpenMM::Platform;
 using OpenMM::ReferencePlatform;
 
-extern "C" OPENMMVRATTLE_EXPORT void registerPlatforms() {
+extern "C" void registerPlatforms() {
 }
 
 // Serves the Reference platform and every platform derived from it, such as CPU.
-extern "C" OPENMMVRATTLE_EXPORT void registerKernelFactories() {
+extern "C" void registerKernelFactories() {
     for (int i = 0; i < Platform::getNumPlatforms(); i++) {
         Platform& platform = Platform::getPlatform(i);
         if (dynamic_cast<ReferencePlatform*>(&platform) != nullptr)
@@ -26,7 +26,7 @@ extern "C" OPENMMVRATTLE_EXPORT void registerKernelFactories() {
     }
 }
 
-extern "C" OPENMMVRATTLE_EXPORT void registerVRattleReferenceKernelFactories() {
+extern "C" void registerVRattleReferenceKernelFactories() {
     registerKernelFactories();
 }
 

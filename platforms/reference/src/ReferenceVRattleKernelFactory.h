@@ -5,7 +5,6 @@
 #define OPENMMVRATTLE_REFERENCEVRATTLEKERNELFACTORY_H_
 
 #include "openmm/KernelFactory.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 
 namespace OpenMMVRattle {
 
@@ -19,6 +18,6 @@ public:
 } // namespace OpenMMVRattle
 
 /** Register the kernels without loading the plugin library by hand (for programs that link with it). */
-extern "C" OPENMMVRATTLE_EXPORT void registerVRattleReferenceKernelFactories();
+extern "C" void registerVRattleReferenceKernelFactories();
 
 #endif // OPENMMVRATTLE_REFERENCEVRATTLEKERNELFACTORY_H_

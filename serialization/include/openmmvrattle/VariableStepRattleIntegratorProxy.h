@@ -5,7 +5,6 @@
 #define OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATORPROXY_H_
 
 #include "openmm/serialization/SerializationProxy.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 
 namespace OpenMMVRattle {
 
@@ -15,7 +14,7 @@ namespace OpenMMVRattle {
  *
  * A step bound that was not set is not written, so that it goes on following the nominal step size.
  */
-class OPENMMVRATTLE_EXPORT VariableStepRattleIntegratorProxy : public OpenMM::SerializationProxy {
+class VariableStepRattleIntegratorProxy : public OpenMM::SerializationProxy {
 public:
     VariableStepRattleIntegratorProxy();
     void serialize(const void* object, OpenMM::SerializationNode& node) const override;
@@ -25,6 +24,6 @@ public:
 } // namespace OpenMMVRattle
 
 /** Make our classes known to OpenMM's XmlSerializer. This happens by itself when the library is loaded. */
-extern "C" OPENMMVRATTLE_EXPORT void registerVRattleSerializationProxies();
+extern "C" void registerVRattleSerializationProxies();
 
 #endif // OPENMMVRATTLE_VARIABLESTEPRATTLEINTEGRATORPROXY_H_

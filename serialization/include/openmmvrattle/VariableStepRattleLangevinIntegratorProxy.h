@@ -5,7 +5,6 @@
 #define OPENMMVRATTLE_VARIABLESTEPRATTLELANGEVININTEGRATORPROXY_H_
 
 #include "openmm/serialization/SerializationProxy.h"
-#include "openmmvrattle/windowsExportVRattle.h"
 
 namespace OpenMMVRattle {
 
@@ -13,7 +12,7 @@ namespace OpenMMVRattle {
  * Writes the settings of a VariableStepRattleLangevinIntegrator to a SerializationNode, and makes a new integrator of them, for
  * OpenMM's XmlSerializer. The same text carries the settings in checkpoints and States.
  */
-class OPENMMVRATTLE_EXPORT VariableStepRattleLangevinIntegratorProxy : public OpenMM::SerializationProxy {
+class VariableStepRattleLangevinIntegratorProxy : public OpenMM::SerializationProxy {
 public:
     VariableStepRattleLangevinIntegratorProxy();
     void serialize(const void* object, OpenMM::SerializationNode& node) const override;
