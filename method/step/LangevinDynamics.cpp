@@ -191,6 +191,7 @@ void LangevinDynamics::takeState(const Vectors& positions, const Vectors& veloci
 // A state has been put in place of the one there was.
 void LangevinDynamics::settle() {
     isInProgress = isAtStart = false;
+    doublings = 0; // for whoever takes steps elsewhere, and lets U_ref follow here
     // Particles without mass stay as they are, in whatever array is written.
     qNow = qMiddle = qNext = q;
     vNow = wMiddle = wNext = vNext = v;
