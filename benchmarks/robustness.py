@@ -10,7 +10,7 @@ the control. The time is long enough for the heat of the start to leave through 
 chooses its steps itself, and is given up after fifty times as many as the others take.
 
 Each run is added to robustness.jsonl when it ends, and one that is there with the same settings is not done again: so
-the benchmark can be stopped and started at any time. With ``--page`` the table goes into docs/langevin.md as well.
+the benchmark can be stopped and started at any time. With ``--page`` the table goes into docs/langevin_benchmark.md.
 """
 
 from __future__ import annotations
@@ -513,7 +513,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--integrators", nargs="+", default=list(INTEGRATORS), choices=list(INTEGRATORS))
     parser.add_argument("--list", action="store_true", help="print the names of all rows")
     parser.add_argument("--output", type=Path, default=Path("out"))
-    parser.add_argument("--page", action="store_true", help="put the table into docs/langevin.md")
+    parser.add_argument("--page", action="store_true", help="put the table into docs/langevin_benchmark.md")
     options = parser.parse_args(arguments)
     if options.list:
         print("\n".join(rows))
@@ -534,7 +534,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         failures += more
     print("\nFirst failures:", *failures, sep="\n  ")
     if options.page:
-        pages.write(pages.DOCS / "langevin.md", "robustness", [pages.provenance(), "", *lines])
+        pages.write(pages.DOCS / "langevin_benchmark.md", "robustness", [pages.provenance(), "", *lines])
     return 0
 
 
