@@ -6,6 +6,8 @@
 #include "GpuTests.h"
 
 #include "TestVariableStepRattleIntegrator.h"
+#include "openmm/AndersenThermostat.h"
+#include "openmm/CMMotionRemover.h"
 #include "openmm/CompoundIntegrator.h"
 #include "openmm/MonteCarloBarostat.h"
 #include "openmm/serialization/XmlSerializer.h"
@@ -92,10 +94,12 @@ Platform& reference() {
 }
 
 // The state of a run on Reference after some steps, as XML.
-std::string stateInMidRun(const TestSystem& t, Integrator_::UpdateMethod update) {
+std::string stateInMidRun(const TestSystem& t, Integrator_::UpdateMethod update, bool isAutomatic = false) {
     On run(t, reference());
     run.integrator.setUpdateMethod(update);
     run.integrator.addMonitor(Integrator_::AppliedForce);
+    if (isAutomatic)
+        run.integrator.useAutomaticStepControl(15);
     run.integrator.setConstraintTolerance(1e-10);
     run.context.setPositions(t.positions);
     run.context.setVelocities(t.velocities);
@@ -128,8 +132,9 @@ double largestOf(const vector<double>& values) {
 
 void testAgreement() {
     const Box t(48);
-    for (auto update : {Integrator_::SemiExplicit, Integrator_::Explicit, Integrator_::Bounded}) {
-        const std::string xml = stateInMidRun(t, update);
+    for (int update = 0; update < 4; update++) {
+        const bool isAutomatic = update == 3;
+        const std::string xml = stateInMidRun(t, (Integrator_::UpdateMethod) (update % 3), isAutomatic);
         On here(t, getTestPlatform()), there(t, reference());
         load(here.context, xml);
         load(there.context, xml);
@@ -149,6 +154,13 @@ void testAgreement() {
                 const double scale = largestOf(expected);
                 for (size_t k = 0; k < expected.size(); k++)
                     ASSERT(std::fabs(found[k] - expected[k]) <= choose(1e-7, 1e-5, 1e-4) * scale);
+            }
+            // The particles have been sorted anew in the first step. In the monitor of half steps is a difference of forces.
+            for (int k = 0; k < (isAutomatic ? 2 : 0); k++) {
+                ASSERT_EQUAL_TOL(there.integrator.getReferenceMonitorValue(k),
+                                 here.integrator.getReferenceMonitorValue(k), 1e-10);
+                ASSERT_EQUAL_TOL(there.integrator.getMonitorValue(k), here.integrator.getMonitorValue(k),
+                                 steps == 1 ? choose(1e-4, 1e-2, 1e-1) : choose(1e-2, 1, 1));
             }
         }
         ASSERT_EQUAL(there.context.getStepCount(), here.context.getStepCount());
@@ -214,9 +226,11 @@ void testEnergiesInBetween() {
 }
 
 // A barostat changes the state by itself; the constraints hold, and rejected moves leave no trace.
-void testBarostat() {
+void testBarostat(bool isAutomatic) {
     const Box t(27, true);
     On run(t, getTestPlatform());
+    if (isAutomatic)
+        run.integrator.useAutomaticStepControl(10);
     run.integrator.setConstraintTolerance(choose(1e-10, 1e-8, 1e-5));
     run.context.setPositions(t.positions);
     run.context.setVelocities(t.velocities);
@@ -230,9 +244,45 @@ void testBarostat() {
     }
     run.context.getState(State::Positions).getPeriodicBoxVectors(box[0], box[1], box[2]);
     ASSERT(box[0][0] != before);
+    if (isAutomatic)
+        ASSERT(run.integrator.getReferenceMonitorValue(1) > 0);
     ASSERT_EQUAL(100, run.context.getStepCount());
     ASSERT(run.integrator.getNumForceEvaluations() >= 101);
     ASSERT(run.integrator.getNumForceEvaluations() <= 101 + 25); // one for each accepted move at most
+}
+
+// Automatic step control where Forces change the state: references follow what they change, and nothing else.
+void testAutomaticControlUnderThermostats() {
+    for (const bool isWarm : {false, true}) {
+        Box t(27);
+        auto* thermostat = new AndersenThermostat(600.0, isWarm ? 100.0 : 1e-9);
+        thermostat->setRandomNumberSeed(5);
+        t.system.addForce(thermostat);
+        if (isWarm)
+            t.system.addForce(new CMMotionRemover(1));
+        On run(t, getTestPlatform());
+        run.integrator.setConstraintTolerance(choose(1e-10, 1e-8, 1e-5));
+        run.integrator.useAutomaticStepControl(10);
+        run.context.setPositions(t.positions);
+        run.context.setVelocities(t.velocities);
+        run.integrator.step(15);
+        double before[2];
+        for (int k = 0; k < 2; k++)
+            before[k] = run.integrator.getReferenceMonitorValue(k);
+        ASSERT(before[0] > 0 && before[1] > 0);
+        for (int i = 0; i < 20; i++) {
+            run.integrator.step(2);
+            ASSERT(run.integrator.getMonitorValue(0) > 0); // which looks at the state in between
+        }
+        for (int k = 0; k < 2; k++) {
+            const double after = run.integrator.getReferenceMonitorValue(k);
+            const double change = std::fabs(after / before[k] - 1);
+            ASSERT(isWarm ? change > 0.01 : change <= 1e-12);
+        }
+        ASSERT_EQUAL(55, run.context.getStepCount());
+        ASSERT(largestConstraintError(run.context) <= choose(2e-10, 1e-6, 1e-4));
+        ASSERT(run.integrator.getNumForceEvaluations() <= 57);
+    }
 }
 
 // A dumbbell beside others flies into a wall that no step can take, in step 31 of 60.
@@ -299,7 +349,9 @@ int main(int argc, char** argv) {
                           {"States move between platforms", testStatesMove},
                           {"reversal", testReversal},
                           {"energies in between", testEnergiesInBetween},
-                          {"a barostat", testBarostat},
+                          {"a barostat", [] { testBarostat(false); }},
+                          {"a barostat and automatic step control", [] { testBarostat(true); }},
+                          {"thermostats and automatic step control", testAutomaticControlUnderThermostats},
                           {"a failure in the middle of a block", testFailureInTheMiddle}},
                          argc, argv);
 }

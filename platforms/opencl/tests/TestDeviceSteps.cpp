@@ -666,6 +666,57 @@ void testFailureLeavesTheStateBefore(const std::string& precision, int length = 
     ASSERT_EQUAL(10, report.numSteps);
 }
 
+// The same with automatic step control, whose numbers are those of the state before too: a wall that is too hard, or whose force is no
+// number, which is noticed a step earlier and when all sums are others already.
+void testFailureOfAutomaticControl(const std::string& precision) {
+    Molecules molecules(1);
+    const int first = molecules.system.getNumParticles();
+    for (int i = 0; i < 2; i++) {
+        molecules.addParticle(12, Vec3(3, 0.1 * i, 0));
+        molecules.velocities[first + i] = Vec3(1, 0, 0);
+    }
+    molecules.addConstraint(first, first + 1);
+    auto* wall = new OpenMM::CustomExternalForce("select(step(x-3.0295), select(isBad, sqrt(3.0295-x), 1e9*x), 0)");
+    wall->addGlobalParameter("isBad", 0);
+    wall->addParticle(first);
+    molecules.system.addForce(wall);
+    Both both(molecules, precision);
+    both.settings = {0.001, 0.00095, 0, 1e-5, StepDensity::Explicit, {}, false, true, {}, 0, 8};
+    both.dynamics.setSettings(both.settings);
+    vector<Vec3> forces = both.forcesAt(molecules.positions);
+    both.dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
+    both.stepOnHost(); // which starts the sequence
+    for (const bool isBad : {false, true}) {
+        const int numGood = isBad ? 28 : 29;
+        both.context.setParameter("isBad", isBad);
+        DeviceSteps::Report reports[2];
+        vector<Vec3> positions[2];
+        for (int attempt = 0; attempt < 2; attempt++) {
+            both.handOver();
+            for (int i = 0; i < (attempt == 0 ? numGood : 60); i++)
+                both.stepOnDevice();
+            reports[attempt] = both.device.read();
+            ASSERT_EQUAL(attempt == 1, reports[attempt].hasFailed);
+            ASSERT_EQUAL(numGood, reports[attempt].numSteps);
+            positions[attempt] = both.positions();
+        }
+        ASSERT_EQUAL(0.0, largestDifference(positions[0], positions[1]));
+        ASSERT(reports[0].state.automatic.numLearnt == 8);
+        const auto* expected = reinterpret_cast<const double*>(&reports[0].state.automatic);
+        const auto* found = reinterpret_cast<const double*>(&reports[1].state.automatic);
+        for (int i = 0; i < Control::NumAutomaticNumbers; i++)
+            ASSERT_EQUAL_TOL(expected[i], found[i], 1e-6);
+        for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
+            ASSERT_EQUAL_TOL(reports[0].state.references[k], reports[1].state.references[k], 1e-6);
+        ASSERT_EQUAL_TOL(reports[0].state.density, reports[1].state.density, 1e-6);
+        // And it goes on from there, where sums of what was no number are of no consequence.
+        both.handOver();
+        for (int i = 0; i < 5; i++)
+            both.stepOnDevice();
+        ASSERT(!both.device.read().hasFailed);
+    }
+}
+
 // Which constraints the device solves, and which are left to the host.
 void testWhatItTakes() {
     ASSERT(DeviceSteps::canTake({}));
@@ -723,6 +774,7 @@ int main(int argc, char** argv) {
          [] { testFailureLeavesTheStateBefore("double", 30); }},
         {"a failure of a large cluster in pieces leaves the state before, mixed",
          [] { testFailureLeavesTheStateBefore("mixed", 400); }},
+        {"a failure with automatic step control, double", [] { testFailureOfAutomaticControl("double"); }},
         {"what it takes", testWhatItTakes}};
     if (argc > 1)
         tests = {tests.at(std::stoi(argv[1]))};
