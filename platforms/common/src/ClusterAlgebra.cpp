@@ -133,16 +133,18 @@ string ClusterAlgebra::writeNewton() const {
         for (int j = 0; j < n; j++)
             if (isEntry(i, j)) {
                 const string w = weight(order[i], order[j]);
-                text += "    mixed " + at("A", i, j) + " = " +
-                        (w.empty() ? string("0") : w + "*dot3(" + at("s", order[i]) + ", " + at("r", order[j]) + ")") +
-                        ";\n";
+                text +=
+                    "    FACTOR " + at("A", i, j) + " = " +
+                    (w.empty() ? string("0")
+                               : "(FACTOR) (" + w + "*dot3(" + at("s", order[i]) + ", " + at("r", order[j]) + "))") +
+                    ";\n";
             }
     for (int p = 0; p < n; p++) {
         text += "    " + at("A", p, p) + " = 1/" + at("A", p, p) + ";\n";
         for (int i = p + 1; i < n; i++) {
             if (!isEntry(i, p))
                 continue;
-            text += "    {\n        const mixed f = " + at("A", i, p) + "*" + at("A", p, p) + ";\n";
+            text += "    {\n        const FACTOR f = " + at("A", i, p) + "*" + at("A", p, p) + ";\n";
             for (int j = p + 1; j < n; j++)
                 if (isEntry(p, j))
                     text += "        " + at("A", i, j) + " -= f*" + at("A", p, j) + ";\n";

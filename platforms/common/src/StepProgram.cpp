@@ -17,6 +17,7 @@ using std::vector;
 
 namespace {
 
+const int MANY_ENTRIES = 16; // of the matrix of Newton's iteration
 const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
 // Of a group that waits for others, about 0.2 s; they come within microseconds.
 const int MAX_POLLS = 1 << 18;
@@ -312,6 +313,8 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
             text = algebra.write() + text;
             replaceAll(text, "FIRST_ATOMS", "{" + first + "}");
             replaceAll(text, "SECOND_ATOMS", "{" + second + "}");
+            // A matrix of many entries, whose rounding another iteration mends, takes half the registers in the type of forces.
+            replaceAll(text, "FACTOR", 2 * algebra.getNumEntries() - numConstraints > MANY_ENTRIES ? "real" : "mixed");
             replaceAll(text, "NUM_ENTRIES", to_string(algebra.getNumEntries()));
         }
         for (const auto& word : map<string, int>{{"NUM_ATOMS", kind.numAtoms},

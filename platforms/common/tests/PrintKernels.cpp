@@ -3,8 +3,8 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, which needs no monitor), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "all" (of up to eight constraints, the densest among them), "large" (a
-// long chain too, in pieces that wait for each other), or "dense" (many bonds on one particle).
+// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other), "dense" (many bonds on one particle), or
+// "rare" with the number of a graph of up to eight constraints, for that alone.
 
 #include "StepProgram.h"
 #include "TestSupport.h"
@@ -16,7 +16,7 @@ using std::vector;
 
 int main(int argc, char** argv) {
     if (argc != 5) {
-        std::cerr << "PrintKernels <precision> <monitor> <update> common|all|large|dense" << std::endl;
+        std::cerr << "PrintKernels <precision> <monitor> <update> common|large|dense|rare<number>" << std::endl;
         return 2;
     }
     const string precision = argv[1], graphs = argv[4];
@@ -31,18 +31,30 @@ int main(int argc, char** argv) {
         for (const auto& pair : pairs)
             system.addConstraint(first + pair.first, first + pair.second, 0.1);
     };
-    add({});
-    add({{0, 1}});
-    add({{0, 1}, {0, 2}});
-    add({{0, 1}, {0, 2}, {0, 3}});
-    add({{0, 1}, {0, 2}, {1, 2}});
-    if (graphs == "all") {
-        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}});
-        add({{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}});
-        add({{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}, {6, 7}, {7, 8}});
-        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}, {0, 7}, {0, 8}});
-        add({{0, 1}, {0, 2}, {0, 3}, {0, 4}, {1, 2}, {2, 3}, {3, 4}, {4, 1}});
-    }
+    const vector<vector<std::pair<int, int>>> common = {
+        {}, {{0, 1}}, {{0, 1}, {0, 2}}, {{0, 1}, {0, 2}, {0, 3}}, {{0, 1}, {0, 2}, {1, 2}}};
+    const vector<vector<std::pair<int, int>>> rare = {{{0, 1}, {1, 2}, {2, 3}}, // chains
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}},
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}},
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}},
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}, {6, 7}},
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 6}, {6, 7}, {7, 8}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}}, // stars
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}, {0, 7}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}, {0, 5}, {0, 6}, {0, 7}, {0, 8}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}}, // a tetrahedron
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 0}, {0, 2}}, // rings
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}, {5, 0}},
+                                                      {{0, 1}, {1, 2}, {2, 3}, {3, 0}, {0, 4}, {1, 5}, {2, 6}, {3, 7}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}, {3, 4}, {4, 5}},
+                                                      {{0, 1}, {0, 2}, {0, 3}, {0, 4}, {1, 2}, {2, 3}, {3, 4}, {4, 1}}};
+    if (graphs.find("rare") == 0)
+        add(rare.at(std::stoi(graphs.substr(4))));
+    else
+        for (const auto& pairs : common)
+            add(pairs);
     vector<std::pair<int, int>> bonds;
     for (int i = 0; i < 400; i++)
         bonds.emplace_back(graphs == "large" ? i : 0, i + 1);

@@ -3,8 +3,8 @@
 """Compile the device's program for NVIDIA GPUs, without one: python compile_kernels.py <PrintKernels>.
 
 The compiler is NVRTC, which OpenMM uses too, of the package nvidia-cuda-nvrtc-cu12. Every kernel must compile for the
-oldest and a newer architecture, and those for common molecules must keep everything in registers. Where there is no
-NVRTC this ends with 77, "skipped".
+oldest and a newer architecture, and keep everything in registers; but for the densest clusters of seven and eight
+constraints, which are not among these. Where there is no NVRTC this ends with 77, "skipped".
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
     ("double", MULTIPLIER_P_NORM, SEMI_EXPLICIT, "common", ("sm_90",)),
-    ("mixed", MULTIPLIER_P_NORM, EXPLICIT, "all", ("sm_90",)),
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "large", ("sm_70", "sm_90")),
     ("double", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_90",)),
@@ -31,6 +30,10 @@ CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_90",)),
     ("double", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "large", ("sm_90",)),
+    *(
+        (precision, CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, kind, ("sm_90",))
+        for precision, kind in (("mixed", "rare4"), ("double", "rare6"), ("mixed", "rare8"), ("double", "rare11"))
+    ),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.
@@ -111,7 +114,7 @@ def main(print_kernels: str) -> int:
             )
             assert {"finishStep", "advanceStep"} <= {kernel[0] for kernel in kernels}, report
             for name, stack, spills, registers in kernels:
-                failed = graphs != "all" and (int(stack) > 0 or int(spills) > 0)
+                failed = int(stack) > 0 or int(spills) > 0
                 num_failed += failed
                 print(
                     f"{'FAILED' if failed else 'passed'}: {precision} update {update} {graphs} {architecture} {name}: "

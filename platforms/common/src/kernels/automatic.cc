@@ -68,11 +68,14 @@ inline DEVICE void followForce(mixed* terms, LastState last, GLOBAL const mm_lon
     }
 }
 
+inline DEVICE void addFlight(mixed* terms, mixed forceSquared, const mixed* v) {
+    terms[TERM_FLIGHT] += sqrt(max(forceSquared, (mixed) 0))*dot3(v, v)*(mixed) LENGTH_WEIGHT;
+}
+
 /** The other terms, with the acceleration a by the net force F - G^T Lambda. */
-inline DEVICE void addAutomaticTerms(mixed* terms, LastState last, int atom, mixed forceSquared, mixed w, const mixed* v, const mixed* a) {
+inline DEVICE void addAutomaticTerms(mixed* terms, LastState last, int atom, mixed w, const mixed* v, const mixed* a) {
     const mixed speedSquared = dot3(v, v), momentum = speedSquared/w;
     terms[TERM_SQUARES] += dot3(a, a)/w + momentum*speedSquared*(mixed) FLIGHT_WEIGHT;
-    terms[TERM_FLIGHT] += sqrt(max(forceSquared, (mixed) 0))*speedSquared*(mixed) LENGTH_WEIGHT;
     terms[TERM_KINETIC] += momentum;
     if (last.change == VELOCITIES_CHANGED) {
         const mixed4 before = last.velocities[atom];

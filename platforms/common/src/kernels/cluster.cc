@@ -14,23 +14,45 @@
 
 CLUSTER_ALGEBRA
 
+/** The distance vectors of the constraints. */
+inline DEVICE void loadVectors_KIND(int c, GLOBAL const int* RESTRICT atoms, GLOBAL const real4* RESTRICT posq, GLOBAL const real4* RESTRICT posqCorrection, mixed (*r)[3]) {
+    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
+    mixed x[NUM_ATOMS][3];
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        loadPosition(posq, posqCorrection, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], x[i]);
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+        UNROLL for (int d = 0; d < 3; d++)
+            r[k][d] = x[first[k]][d] - x[second[k]][d];
+}
+
 /** Lambda(q,v) (4.3), and the terms of the monitors there. */
-inline DEVICE void measure_KIND(mixed (*r)[3], mixed* L, mixed (*v)[3], mixed (*a)[3], mixed* w, mixed* forceSquared, mixed* lambda, mixed* sums) {
+inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mm_long* force, mixed (*r)[3], mixed* L, mixed (*v)[3], mixed* w,
+        mixed* lambda, mixed* sums) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed rightSide[NUM_CONSTRAINTS];
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
-        mixed y = 0;
-        UNROLL for (int d = 0; d < 3; d++) {
-            const mixed u = v[first[k]][d] - v[second[k]][d];
-            y += u*u + r[k][d]*(a[first[k]][d] - a[second[k]][d]);
-        }
-        rightSide[k] = lambda[k] = y;
+        mixed u[3];
+        UNROLL for (int d = 0; d < 3; d++)
+            u[d] = v[first[k]][d] - v[second[k]][d];
+        rightSide[k] = dot3(u, u);
     }
+    mixed forceSquared = 1;
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        mixed a[3];
+        forceSquared = loadAcceleration(AGAIN(NUM_CONSTRAINTS > 6 && forceSquared > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], a);
+        addParticleTerms(sums, forceSquared, w[i], v[i]);
+        UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
+            if (first[k] == i)
+                rightSide[k] += dot3(r[k], a);
+            if (second[k] == i)
+                rightSide[k] -= dot3(r[k], a);
+        }
+    }
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+        lambda[k] = rightSide[k];
     solve_KIND(L, lambda);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         addConstraintTerms(sums, lambda[k], rightSide[k]);
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        addParticleTerms(sums, forceSquared[i], w[i], v[i]);
 }
 
 /** v += factor M^-1 G^T x */
@@ -44,80 +66,97 @@ inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mi
         }
 }
 
+// Registers are what clusters of many constraints lack. So what is needed again after a solution is read AGAIN and not kept, and those of
+// seven and more constraints, in which that saves nothing else, read one particle after the other and not all at once.
+
 /** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
 inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed x[NUM_ATOMS][3], v[NUM_ATOMS][3], a[NUM_ATOMS][3], w[NUM_ATOMS], forceSquared[NUM_ATOMS];
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        loadPosition(posq, posqCorrection, atom, x[i]);
-        w[i] = loadVelocity(velm, atom, v[i]);
-        forceSquared[i] = loadAcceleration(force, paddedNumAtoms, atom, w[i], a[i]);
-    }
+    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], x1[NUM_CONSTRAINTS];
+    loadVectors_KIND(c, atoms, posq, posqCorrection, r);
+    bool isRegular = true;
 #if UPDATE == AUTOMATIC
     mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        followForce(terms, last, force, paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], v[i][0], v[i][1], v[i][2]);
 #endif
-#if HALF_SUMS
-    mixed before[NUM_ATOMS][3];
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+        mixed a[3];
+        const bool isReady = (NUM_CONSTRAINTS > 6 && (i == 0 ? r[0][0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
+        isRegular = loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a) >= 0 && isRegular;
+#if UPDATE == AUTOMATIC
+        followForce(terms, last, force, paddedNumAtoms, atom, w[i], v[i][0], v[i][1], v[i][2]);
 #endif
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        UNROLL for (int d = 0; d < 3; d++) {
-#if HALF_SUMS
-            before[i][d] = v[i][d];
-#endif
-            v[i][d] += kick*a[i][d];
-        }
-    mixed r[NUM_CONSTRAINTS][3], L[NUM_ENTRIES], x1[NUM_CONSTRAINTS];
+        UNROLL for (int d = 0; d < 3; d++)
+            v[i][d] += kick*a[d];
+    }
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         x1[k] = 0;
-        UNROLL for (int d = 0; d < 3; d++) {
-            r[k][d] = x[first[k]][d] - x[second[k]][d];
+        UNROLL for (int d = 0; d < 3; d++)
             x1[k] += r[k][d]*(v[first[k]][d] - v[second[k]][d]);
-        }
     }
-    bool isRegular = factorize_KIND(r, w, L);
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        isRegular = isRegular && forceSquared[i] >= 0;
+    isRegular = factorize_KIND(r, w, L) && isRegular;
     solve_KIND(L, x1);
     push_KIND(r, w, x1, -1, v);
-    if (isStored)
-        UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-            velm[atoms[ATOM_BASE + i*NUM_CLUSTERS + c]] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
-    measure_KIND(r, L, v, a, w, forceSquared, x1, sums);
+    const bool isPushed = x1[0] > 0;
+    measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isPushed, force), r, L, v, w, x1, sums);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = x1[k];
-#if HALF_SUMS
-    if (formHalf) {
-        UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-            UNROLL for (int d = 0; d < 3; d++)
-                before[i][d] = v[i][d] - halfKick*a[i][d];
-        push_KIND(r, w, x1, halfKick, before);
-    }
-    measure_KIND(r, L, before, a, w, forceSquared, x1, halfSums);
-#endif
 #if UPDATE == AUTOMATIC
-    push_KIND(r, w, x1, -1, a); // F - G^T Lambda
+    mixed net[NUM_ATOMS][3]; // M^-1 (F - G^T Lambda)
     UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        addAutomaticTerms(terms, last, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], forceSquared[i], w[i], v[i], a[i]);
+        addFlight(terms, loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]), v[i]);
+    push_KIND(r, w, x1, -1, net);
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        addAutomaticTerms(terms, last, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], v[i], net[i]);
     addCluster(sums, terms, last, atoms[ATOM_BASE + c]);
+#endif
+    // The on-step velocities go out, and those of the half step take their place.
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+#if HALF_SUMS
+        mixed before[3], a[3];
+        const bool isReady = ((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        loadVelocity(AGAIN(isReady, velm), atom, before);
+        loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
+#endif
+        if (isStored)
+            velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
+#if HALF_SUMS
+        UNROLL for (int d = 0; d < 3; d++)
+            v[i][d] = (formHalf ? v[i][d] - halfKick*a[d] : before[d]);
+#endif
+    }
+#if HALF_SUMS
+    push_KIND(r, w, x1, formHalf ? halfKick : (mixed) 0, v);
+    measure_KIND(c, paddedNumAtoms, atoms, AGAIN(v[0][0] > 0, force), r, L, v, w, x1, halfSums);
 #endif
     return isRegular;
 }
 
+/** The velocities after the kick of a step of size dt. */
+inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed dt, mixed* w, mixed (*v)[3]) {
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+        const bool isReady = (NUM_CONSTRAINTS > 6 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
+        mixed a[3];
+        w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
+        loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
+        UNROLL for (int d = 0; d < 3; d++)
+            v[i][d] += dt/2*a[d];
+    }
+}
+
 /**
- * Solve g(q + dt (v + M^-1 G^T gamma/dt)) = 0 by Newton's iteration from gamma = -dt^2/2 lambda; v are the kicked velocities and
- * get the impulses. Returns the number of iterations, or -1 if they do not converge. There is at least one, since lambda itself,
- * unrefined, costs accuracy even where it meets the tolerance.
+ * Solve g(q + dt (v + M^-1 G^T gamma/dt)) = 0 by Newton's iteration from gamma = -dt^2/2 lambda; v are the kicked velocities. Returns
+ * the number of iterations, or -1 if they do not converge. There is at least one, since lambda itself, unrefined, costs accuracy even
+ * where it meets the tolerance.
  */
 inline DEVICE int constrain_KIND(int c, mixed dt, mixed tolerance, GLOBAL const mixed* RESTRICT lengths, GLOBAL const mixed* RESTRICT multipliers,
         mixed (*r)[3], mixed* w, mixed (*v)[3], mixed* gamma) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed s[NUM_CONSTRAINTS][3], squared[NUM_CONSTRAINTS];
+    mixed s[NUM_CONSTRAINTS][3];
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
-        const mixed length = lengths[LENGTH_BASE + k*NUM_CLUSTERS + c];
-        squared[k] = length*length;
         gamma[k] = -dt*dt/2*multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c];
         UNROLL for (int d = 0; d < 3; d++)
             s[k][d] = r[k][d] + dt*(v[first[k]][d] - v[second[k]][d]);
@@ -129,8 +168,9 @@ inline DEVICE int constrain_KIND(int c, mixed dt, mixed tolerance, GLOBAL const 
         mixed g[NUM_CONSTRAINTS], error = 0;
         bool isNumber = true;
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
-            g[k] = (squared[k] - dot3(s[k], s[k]))/2;
-            const mixed e = fabs(g[k])/squared[k];
+            const mixed length = lengths[LENGTH_BASE + k*NUM_CLUSTERS + c], squared = length*length;
+            g[k] = (squared - dot3(s[k], s[k]))/2;
+            const mixed e = fabs(g[k])/squared;
             error = max(error, e);
             isNumber = isNumber && e < (mixed) 1e30f;
         }
@@ -145,62 +185,50 @@ inline DEVICE int constrain_KIND(int c, mixed dt, mixed tolerance, GLOBAL const 
             move_KIND(r, w, g, s);
         }
     }
-    push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
     return iterations;
 }
 
 /** The monitors at the half-step velocities of a step of size dt; returns false if there is no such step. */
 inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed* sums) {
-    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed x[NUM_ATOMS][3], v[NUM_ATOMS][3], a[NUM_ATOMS][3], w[NUM_ATOMS], forceSquared[NUM_ATOMS];
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        loadPosition(posq, posqCorrection, atom, x[i]);
-        w[i] = loadVelocity(velm, atom, v[i]);
-        forceSquared[i] = loadAcceleration(force, paddedNumAtoms, atom, w[i], a[i]);
-        UNROLL for (int d = 0; d < 3; d++)
-            v[i][d] += dt/2*a[i][d];
-    }
-    mixed r[NUM_CONSTRAINTS][3], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
-    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-        UNROLL for (int d = 0; d < 3; d++)
-            r[k][d] = x[first[k]][d] - x[second[k]][d];
+    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
+    loadVectors_KIND(c, atoms, posq, posqCorrection, r);
+    const bool isLoaded = (NUM_CONSTRAINTS > 6 && r[0][0] > 0);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
     const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) // where the next trial starts
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
             multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = -2*gamma[k]/(dt*dt);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), dt, w, v);
+    push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
     const bool isRegular = factorize_KIND(r, w, L);
-    measure_KIND(r, L, v, a, w, forceSquared, gamma, sums);
+    measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isRegular, force), r, L, v, w, gamma, sums);
     return isRegular && iterations >= 0;
 }
 
 /** (3.9)-(3.11); returns the number of iterations, or -1 if they do not converge. */
 inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities) {
-    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed x[NUM_ATOMS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], gamma[NUM_CONSTRAINTS];
+    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], gamma[NUM_CONSTRAINTS];
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        mixed a[3];
-        const real charge = loadPosition(posq, posqCorrection, atom, x[i]);
-        w[i] = loadVelocity(velm, atom, v[i]);
-        loadAcceleration(force, paddedNumAtoms, atom, w[i], a);
-        oldPositions[atom] = make_mixed4(x[i][0], x[i][1], x[i][2], charge);
-        oldVelocities[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
-        UNROLL for (int d = 0; d < 3; d++)
-            v[i][d] += dt/2*a[d];
+        mixed x[3];
+        const real charge = loadPosition(posq, posqCorrection, atom, x);
+        oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
+        oldVelocities[atom] = velm[atom];
     }
-    mixed r[NUM_CONSTRAINTS][3];
-    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-        UNROLL for (int d = 0; d < 3; d++)
-            r[k][d] = x[first[k]][d] - x[second[k]][d];
+    loadVectors_KIND(c, atoms, posq, posqCorrection, r);
+    const bool isLoaded = (NUM_CONSTRAINTS > 6 && r[0][0] > 0);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
     const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
-    if (iterations >= 0)
+    if (iterations >= 0) {
+        loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), dt, w, v);
+        push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
         UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
             const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-            // Read again rather than kept: registers are what large clusters lack.
-            const mixed4 old = oldPositions[atom];
-            storePosition(posq, posqCorrection, atom, old.x + dt*v[i][0], old.y + dt*v[i][1], old.z + dt*v[i][2], (real) old.w);
+            mixed x[3];
+            const real charge = loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, x);
+            storePosition(posq, posqCorrection, atom, x[0] + dt*v[i][0], x[1] + dt*v[i][1], x[2] + dt*v[i][2], charge);
             velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
         }
+    }
     return iterations;
 }

@@ -666,7 +666,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     UNROLL for (int d = 0; d < 3; d++)
                         a[d] -= w*push[d];
                     followForce(sums, task.last, force, paddedNumAtoms, atom, w, before[3*i], before[3*i+1], before[3*i+2]);
-                    addAutomaticTerms(sums, task.last, atom, forceSquared, w, v, a);
+                    addFlight(sums, forceSquared, v);
+                    addAutomaticTerms(sums, task.last, atom, w, v, a);
                 }
 #endif
 #if HALF_SUMS

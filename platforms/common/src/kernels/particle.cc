@@ -22,7 +22,8 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 #if UPDATE == AUTOMATIC
     mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
     followForce(terms, last, force, paddedNumAtoms, atom, inverseMass, w[0], w[1], w[2]);
-    addAutomaticTerms(terms, last, atom, forceSquared, inverseMass, v, a);
+    addFlight(terms, forceSquared, v);
+    addAutomaticTerms(terms, last, atom, inverseMass, v, a);
     addCluster(sums, terms, last, atom);
 #endif
     return forceSquared >= 0;

@@ -198,6 +198,8 @@ inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
 #define CLUSTER_PARAMETERS int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed* RESTRICT lengths, \
         GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, \
         GLOBAL mixed* RESTRICT multipliers
+// The same address, which a compiler does not know, and not before the condition: it loads anew what it would else have to keep.
+#define AGAIN(condition, pointer) ((pointer) + ((condition) && paddedNumAtoms < 0 ? 1 : 0))
 #define CLUSTER_ARGUMENTS paddedNumAtoms, atoms, lengths, posq, posqCorrection, velm, force, multipliers
 
 CLUSTER_FUNCTIONS
