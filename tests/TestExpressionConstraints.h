@@ -95,7 +95,7 @@ inline void testRunsWithExpressionsGoOn() {
     integrator.step(20);
     other.step(5);
     loadCheckpoint(otherContext, checkpointOf(context));
-    ASSERT(Trace(context, integrator, 20).numbers == Trace(otherContext, other, 20).numbers);
+    assertSame(Trace(context, integrator, 20), Trace(otherContext, other, 20));
     Integrator_ bare = makePendulumIntegrator();
     bare.clearMonitors();
     Context bareContext(t.system, bare, getTestPlatform());

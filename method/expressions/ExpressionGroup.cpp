@@ -2,41 +2,16 @@
 // SPDX-License-Identifier: MIT
 
 #include "expressions/ExpressionGroup.h"
-#include "lepton/ParsedExpression.h"
-#include "lepton/Parser.h"
 #include <algorithm>
-#include <utility>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
-using std::string;
 using std::vector;
 
-ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) : numParticles((int) example.particles.size()) {
-    const char* const axes[] = {"x", "y", "z"};
-    for (int i = 0; i < 3 * numParticles; i++)
-        coordinates.push_back(graph.addVariable(axes[i % 3] + std::to_string(i / 3 + 1)));
-    for (const auto& parameter : example.parameters)
-        parameters.push_back(graph.addVariable(parameter.first));
-    // Not optimized by Lepton, which for a constant that is not a number would go on for ever; the graph does it.
-    value = graph.addExpression(Lepton::Parser::parse(example.expression).getRootNode());
-    // These names can not be written in an expression.
-    vector<std::pair<int, int>> motions[2], motionOfParameters;
-    for (int i = 0; i < 3 * numParticles; i++) {
-        velocities.push_back(graph.addVariable("velocity " + std::to_string(i)));
-        motions[0].emplace_back(coordinates[i], velocities[i]);
-    }
-    for (size_t i = 0; i < parameters.size(); i++) {
-        parameterRates.push_back(graph.addVariable("rate " + std::to_string(i)));
-        motionOfParameters.emplace_back(parameters[i], parameterRates[i]);
-    }
-    motions[1] = motions[0];
-    motions[1].insert(motions[1].end(), motionOfParameters.begin(), motionOfParameters.end());
-    for (int i = 0; i < 2; i++) {
-        rate[i] = graph.differentiate(value, motions[i]);
-        curvature[i] = graph.differentiate(rate[i], motions[i]);
-    }
-    parameterMotion = graph.differentiate(value, motionOfParameters);
+ExpressionGroup::ExpressionGroup(const ExpressionConstraint& example) :
+        numParticles((int) example.particles.size()), nodes(example) {
+    for (const vector<int>* some : {&nodes.coordinates, &nodes.velocities, &nodes.parameters, &nodes.parameterRates})
+        inputs.insert(inputs.end(), some->begin(), some->end());
 }
 
 void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int firstEntry, int firstParameter,
@@ -50,26 +25,23 @@ void ExpressionGroup::add(const ExpressionConstraint& constraint, int index, int
 }
 
 ExpressionGroup::Program ExpressionGroup::make(const vector<int>& outputs) const {
-    vector<int> inputs = coordinates;
-    for (const vector<int>* more : {&velocities, &parameters, &parameterRates})
-        inputs.insert(inputs.end(), more->begin(), more->end());
-    return Program(new ArrayExpression(graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
+    return Program(new ArrayExpression(nodes.graph, inputs, outputs, std::min(MAX_BLOCK_SIZE, getNumConstraints())));
 }
 
 void ExpressionGroup::compile() {
-    valueProgram = make({value});
-    jacobianProgram = make(graph.findGradient(value, coordinates));
-    motionProgram = make({parameterMotion});
+    valueProgram = make({nodes.value});
+    jacobianProgram = make(nodes.gradient);
+    motionProgram = make({nodes.parameterMotion});
     for (int i = 0; i < 2; i++) {
-        curvaturePrograms[i] = make({curvature[i]});
-        velocityJacobianPrograms[i] = make(graph.findGradient(rate[i], coordinates));
+        curvaturePrograms[i] = make({nodes.curvature[i]});
+        velocityJacobianPrograms[i] = make(nodes.graph.findGradient(nodes.rate[i], nodes.coordinates));
     }
 }
 
 // Run a program on the constraints of a range, block by block, and call store(work, first, count) after each.
 template <class Store>
 void ExpressionGroup::run(const ArrayExpression& program, const Range& range, const Store& store) const {
-    const int numCoordinates = 3 * numParticles, numParameters = (int) parameters.size();
+    const int numCoordinates = 3 * numParticles, numParameters = (int) nodes.parameters.size();
     thread_local vector<double> memory; // of the thread, since others may be at work on other ranges
     memory.resize(std::max(memory.size(), program.getWorkSize()));
     double* const work = memory.data();

@@ -5,20 +5,12 @@
 #define OPENMMVRATTLE_EXPRESSIONGROUP_H_
 
 #include "expressions/ArrayExpression.h"
+#include "expressions/ExpressionDerivatives.h"
 #include "openmm/Vec3.h"
-#include <map>
 #include <memory>
-#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
-
-/** A constraint g(x1, y1, z1, x2, ...) = 0 of the positions of some particles (nm), given as an expression. */
-struct ExpressionConstraint {
-    std::string expression;
-    std::vector<int> particles;
-    std::map<std::string, double> parameters;
-};
 
 /**
  * The parameters theta of all expressions of a system, in the order that ConstraintSystem gives them, and their rates of change
@@ -94,12 +86,8 @@ private:
     void runValues(const ArrayExpression& program, const Range& range, std::vector<double>& result, bool mustAdd) const;
     void runRows(const ArrayExpression& program, const Range& range, std::vector<OpenMM::Vec3>& jacobian) const;
     int numParticles;
-    ExpressionGraph graph;
-    std::vector<int> coordinates, velocities, parameters,
-        parameterRates; // variables of the graph, in this order the inputs of all programs
-    // Nodes: g, its derivative along the motion of the parameters alone, the one along v, and the derivative of this along v.
-    // Of two, the second is along the motion of the parameters too.
-    int value, parameterMotion, rate[2], curvature[2];
+    ExpressionDerivatives nodes;
+    std::vector<int> inputs; // of all programs: coordinates, velocities, parameters and their rates
     Program valueProgram, jacobianProgram, motionProgram, curvaturePrograms[2], velocityJacobianPrograms[2];
     std::vector<int> indices, firstParameters, particles, entries; // NO_ENTRY for a particle without mass
 };

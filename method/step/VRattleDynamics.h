@@ -98,6 +98,10 @@ public:
         return now.theta;
     }
     /** Put those that are set in force at once, before positions are projected and the run starts afresh with begin(). */
+    /** Whether the next step and the last one are steps at the same parameters. */
+    bool areParametersAtRest() const {
+        return target == now.theta.values && !now.theta.isMoving;
+    }
     void adoptParameters();
     /**
      * Go on from a saved state as if nothing had happened. The positions and velocities are taken as they are, so that the

@@ -27,8 +27,9 @@ int findRoot(vector<int>& parents, int particle) {
 
 } // namespace
 
-ClusterKinds::ClusterKinds(const OpenMM::System& system) {
+ClusterKinds::ClusterKinds(const OpenMM::System& system, const vector<char>& areElsewhere) {
     const int numParticles = system.getNumParticles();
+    auto isHere = [&](int i) { return system.getParticleMass(i) != 0 && (areElsewhere.empty() || !areElsewhere[i]); };
     vector<int> parents(numParticles), degrees(numParticles, 0);
     std::iota(parents.begin(), parents.end(), 0);
     vector<Bond> bonds;
@@ -36,7 +37,7 @@ ClusterKinds::ClusterKinds(const OpenMM::System& system) {
         Bond bond;
         bond.constraint = k;
         system.getConstraintParameters(k, bond.particle1, bond.particle2, bond.length);
-        if (system.getParticleMass(bond.particle1) == 0 || system.getParticleMass(bond.particle2) == 0)
+        if (!isHere(bond.particle1) || !isHere(bond.particle2))
             continue; // OpenMM allows it between two massless particles, which nobody moves
         parents[findRoot(parents, bond.particle1)] = findRoot(parents, bond.particle2);
         degrees[bond.particle1]++;
@@ -45,7 +46,7 @@ ClusterKinds::ClusterKinds(const OpenMM::System& system) {
     }
     std::map<int, pair<vector<int>, vector<Bond>>> clusters;
     for (int i = 0; i < numParticles; i++)
-        if (system.getParticleMass(i) != 0)
+        if (isHere(i))
             clusters[findRoot(parents, i)].first.push_back(i);
     for (const Bond& bond : bonds)
         clusters[findRoot(parents, bond.particle1)].second.push_back(bond);

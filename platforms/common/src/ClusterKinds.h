@@ -22,12 +22,13 @@ struct ClusterKind {
     std::vector<std::vector<int>> constraints;      // of each cluster, by indices of the System
 };
 
-/** Sort the particles of a System that have mass into kinds; those with most constraints come first. */
+/** Sort the particles of a System that have mass into kinds by their distance constraints; those with most come first. */
 class ClusterKinds {
 public:
     /** What one thread can have. */
     static const int MAX_CONSTRAINTS = 8;
-    explicit ClusterKinds(const OpenMM::System& system);
+    /** @param areElsewhere    particles to be left out, with their constraints; none if it is empty */
+    explicit ClusterKinds(const OpenMM::System& system, const std::vector<char>& areElsewhere = {});
     /** The kinds with up to MAX_CONSTRAINTS constraints, and those with more. */
     std::vector<ClusterKind> small, large;
 };

@@ -3,6 +3,7 @@
 
 #include "CommonRunDevice.h"
 #include "ComputeVectors.h"
+#include "ExpressionInfo.h"
 #include "constraints/StepFailure.h"
 #include "openmm/common/ContextSelector.h"
 #include "run/HostVRattleDevice.h"
@@ -44,13 +45,20 @@ template <class Host>
 CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                        const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
-        compute(compute), state(), lastReport(), isOnDevice(false), hasBegun(false), isOnHost(true),
-        areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
+        compute(compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false), hasBegun(false),
+        isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
         lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
         writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
+    // Too late where the Context's other integrators have initialized it already: then molecules that differ in expressions alone may
+    // change places on the device, and the host takes the steps.
+    const bool areKnown = settings.expressions.empty() || !compute.getEnergyBuffer().isInitialized();
+    if (!settings.expressions.empty() && areKnown) {
+        expressionInfo = new ExpressionInfo(settings.expressions);
+        compute.addForce(expressionInfo); // to which it belongs from now on
+    }
     compute.initializeContexts();
-    if (DeviceSteps::canTake(settings.expressions))
-        steps = std::make_unique<DeviceSteps>(compute, context.getSystem());
+    if (areKnown && DeviceSteps::canTake(settings.expressions))
+        steps = std::make_unique<DeviceSteps>(compute, context.getSystem(), settings.expressions);
     ContextSelector selector(compute);
     compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context
 }
@@ -111,11 +119,22 @@ template <class Host> void CommonRunDevice<Host>::ensureForces() {
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
 template <class Host> bool CommonRunDevice<Host>::canStepOnDevice() {
-    return steps != nullptr && !reach.isUnknown && ahead == nullptr && canGoOnDevice();
+    return steps != nullptr && !reach.isUnknown && ahead == nullptr && (expressions.empty() || takesExpressions()) &&
+           canGoOnDevice();
+}
+
+// Where parameters of expressions are others now molecules may be so too, that were identical; then OpenMM puts them into another order.
+template <class Host> void CommonRunDevice<Host>::setDeviceParameters() {
+    if (expressions.empty() || !steps->setParameters(expressions))
+        return;
+    ContextSelector selector(compute);
+    expressionInfo->setParameters(expressions);
+    compute.invalidateMolecules(expressionInfo);
 }
 
 // The state goes to the device, where positions, velocities and forces are.
 template <class Host> void CommonRunDevice<Host>::beginOnDevice() {
+    setDeviceParameters();
     ensureForces();
     if (!areSettingsOnDevice)
         steps->setSettings(makeDeviceSettings());

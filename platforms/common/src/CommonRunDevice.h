@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_COMMONRUNDEVICE_H_
 
 #include "DeviceSteps.h"
+#include "ExpressionInfo.h"
 #include "openmm/internal/ContextImpl.h"
 #include "run/RunDevice.h"
 #include "run/RunState.h"
@@ -67,6 +68,10 @@ protected:
     bool differ(const Vectors& a, const Vectors& b) override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
+    /** Whether the kernels of the steps in force know constraints that are given as expressions. */
+    virtual bool takesExpressions() {
+        return false;
+    }
     /** The settings in force, for the GPU. */
     virtual DeviceSteps::Settings makeDeviceSettings() = 0;
     /** What there is of the host's state beside positions, velocities and forces. */
@@ -93,11 +98,13 @@ private:
     void ensureForces();
     int getNumWrites() const;
     void readState();
+    void setDeviceParameters();
     void beginOnDevice();
     void stepOnDevice(double maxTime);
     void accept(const DeviceSteps::Report& report);
     OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
+    ExpressionInfo* expressionInfo;     // of the Context, or null
     std::unique_ptr<DeviceSteps> steps; // none where the host takes them all
     DeviceSteps::State state; // of the device when it was read last
     DeviceSteps::Report lastReport;

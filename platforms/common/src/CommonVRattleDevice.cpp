@@ -24,9 +24,14 @@ CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::C
 bool CommonVRattleDevice::canGoOnDevice() {
     const vector<double> references = vrattle.getReferences();
     // Automatic step control finds its references on the way.
-    return vrattle.hasStarted() &&
+    return vrattle.hasStarted() && vrattle.areParametersAtRest() &&
            (settings.isAutomatic ||
             std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
+}
+
+// Those of automatic step control do not.
+bool CommonVRattleDevice::takesExpressions() {
+    return !settings.isAutomatic;
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {

@@ -31,6 +31,9 @@ static_assert(StepProgram::MAX_STAGES < STAMPS, "stages of two launches would ha
 // is asked for they are projected twice.
 const double SINGLE_PROJECTION = 2e-9;
 
+// Of all expressions and their derivatives: compilers take their time.
+const size_t MOST_OPERATIONS = 20000;
+
 // Local memory of a work group, of which every device of OpenCL has 32 kB, every GPU of NVIDIA 48.
 LargeClusters::Limits findLimits(OpenMM::ComputeContext& context) {
     const bool isCUDA = context.getContextImpl()->getPlatform().getName() == "CUDA";
@@ -60,21 +63,32 @@ void addEmpty(ComputeKernel& kernel, int count) {
 
 } // namespace
 
-DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system) :
-        DeviceSteps(context, ClusterKinds(system)) {
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+                         const vector<ExpressionConstraint>& expressions) :
+        DeviceSteps(context, system,
+                    expressions.empty() ? nullptr : std::make_unique<ExpressionSteps>(context, system, expressions)) {
 }
 
-DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters) :
-        context(context), kinds(clusters.small), large(clusters.large, findLimits(context)), settings(),
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+                         std::unique_ptr<ExpressionSteps>&& expressions) :
+        DeviceSteps(context,
+                    ClusterKinds(system, expressions ? expressions->getClusters().getMembers() : vector<char>()),
+                    std::move(expressions)) {
+}
+
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters,
+                         std::unique_ptr<ExpressionSteps>&& someExpressions) :
+        context(context), expressions(std::move(someExpressions)), kinds(clusters.small),
+        large(clusters.large, findLimits(context)), settings(),
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
-        isWide(context.getSupportsDoublePrecision()), groupSize(StepProgram::getGroupSize(!large.isEmpty())),
-        numGroups(0), numPartials(0), numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0),
-        numTrials(MOST_TRIALS), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0),
-        areVelocitiesKept(false) {
+        isWide(context.getSupportsDoublePrecision()),
+        groupSize(StepProgram::getGroupSize(!large.isEmpty() || expressions)), numGroups(0), numPartials(0),
+        numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), numTrials(MOST_TRIALS),
+        groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0), areVelocitiesKept(false) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
-    return expressions.empty();
+    return ExpressionClusters::findSize(expressions) <= MOST_OPERATIONS;
 }
 
 double DeviceSteps::tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance) {
@@ -109,7 +123,7 @@ void DeviceSteps::initialize() {
     const int numPieces = (int) large.getPieces().size();
     numFused = large.getForm().isFused ? numPieces : 0;
     numGroups = std::max(1, std::min(needed, context.getNumThreadBlocks() - numFused));
-    numPartials = numGroups + numPieces;
+    numPartials = numGroups + (expressions ? expressions->getNumParts() : 0) + numPieces;
     oldPositions.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldPositions");
     oldVelocities.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldVelocities");
     for (OpenMM::ComputeArray& array : trials)
@@ -120,6 +134,8 @@ void DeviceSteps::initialize() {
     context.clearBuffer(iterationCounts);
     if (!large.isEmpty())
         initializeLarge();
+    if (expressions)
+        expressions->initialize(isMixed);
 }
 
 void DeviceSteps::initializeLarge() {
@@ -183,7 +199,8 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
 }
 
 void DeviceSteps::compile(StepProgram::Update update) {
-    std::unique_ptr<StepProgram> next(new StepProgram(kinds, large, settings.terms, update, isMixed, isWide));
+    std::unique_ptr<StepProgram> next(new StepProgram(kinds, large, expressions ? &expressions->getClusters() : nullptr,
+                                                      large.getNumThreads(), settings.terms, update, isMixed, isWide));
     const bool isFirst = program == nullptr;
     program.swap(next);
     if (isFirst)
@@ -233,6 +250,10 @@ void DeviceSteps::compile(StepProgram::Update update) {
         setArguments(created);
         if (!large.isEmpty() && numFused == 0)
             setLargeArguments(created);
+        if (expressions)
+            created.expressions = expressions->create(
+                text, program->hasHalfSums(),
+                {settingsArray, partials, failure, oldPositions, oldVelocities, numGroups, numPartials});
         found = compiled.insert({key, created}).first;
     }
     kernels = found->second;
@@ -404,6 +425,11 @@ void DeviceSteps::launchFinish(int step, double kick, Control::Change change, bo
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control[half]);
     launch(kernels.finish, 18);
+    if (expressions) {
+        expressions->launchFinish(kernels.expressions, step, kick, change != Control::NothingChanged, isStored,
+                                  control[half]);
+        numLaunches++;
+    }
     if (!kernels.finishLarge)
         return;
     const int numProjections = getNumProjections();
@@ -423,6 +449,11 @@ void DeviceSteps::launchEvaluate(int step, Control::Change change) {
     kernels.evaluate->setArg(4, control[half]);
     kernels.evaluate->execute(groupSize, groupSize);
     numLaunches++;
+}
+
+bool DeviceSteps::setParameters(const vector<ExpressionConstraint>& given) {
+    OpenMM::ContextSelector selector(context);
+    return expressions && expressions->setParameters(given);
 }
 
 bool DeviceSteps::begin(const State& state, double energy) {
@@ -496,6 +527,11 @@ void DeviceSteps::advance(double maxStep) {
             kernels.trial->setArg(10, trials[(i + 1) % 2]);
             kernels.trial->setArg(11, trialPartials[(i + 1) % 2]);
             launch(kernels.trial, 22);
+            if (expressions) {
+                expressions->launchTrial(kernels.expressions, stepNumber, settings.tolerance, trials[(i + 1) % 2],
+                                         trialPartials[(i + 1) % 2]);
+                numLaunches++;
+            }
             if (kernels.tryLarge) {
                 setMixed(kernels.tryLarge, 5, settings.tolerance);
                 kernels.tryLarge->setArg(7, trials[(i + 1) % 2]);
@@ -514,6 +550,10 @@ void DeviceSteps::advance(double maxStep) {
     kernels.advance->setArg(10, trialPartials[numTrials % 2]);
     launch(kernels.advance, 24);
     half = 1 - half;
+    if (expressions) {
+        expressions->launchAdvance(kernels.expressions, stepNumber, settings.tolerance, control[half]);
+        numLaunches++;
+    }
     if (kernels.advanceLarge) {
         setMixed(kernels.advanceLarge, 5, settings.tolerance);
         kernels.advanceLarge->setArg(6, control[half]);
@@ -625,6 +665,10 @@ long long DeviceSteps::getNumIterations() {
         vector<int> largeCounts;
         largeIterations.download(largeCounts);
         counts.insert(counts.end(), largeCounts.begin(), largeCounts.end());
+    }
+    if (expressions) {
+        const vector<int> partCounts = expressions->getNumIterations();
+        counts.insert(counts.end(), partCounts.begin(), partCounts.end());
     }
     return *std::max_element(counts.begin(), counts.end());
 }

@@ -5,9 +5,9 @@
 #define OPENMMVRATTLE_DEVICESTEPS_H_
 
 #include "ClusterKinds.h"
+#include "ExpressionSteps.h"
 #include "LargeClusters.h"
 #include "StepProgram.h"
-#include "expressions/ExpressionGroup.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
 #include <map>
@@ -59,11 +59,15 @@ public:
 
     /** Whether all constraints are of those that the device can solve. */
     static bool canTake(const std::vector<ExpressionConstraint>& expressions);
-    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system);
+    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+                const std::vector<ExpressionConstraint>& expressions = {});
     /** Take over settings, after which begin() is due. */
     void setSettings(const Settings& settings);
     /** The tolerance that is in force where another is asked for: rounding allows none below a certain one. */
     static double tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance);
+
+    /** Take over the parameters of expressions, all that were given, after which begin() is due; returns whether they are others. */
+    bool setParameters(const std::vector<ExpressionConstraint>& given);
 
     /**
      * Take over a state: the positions and velocities that are on the device, where the forces have been computed. The velocities
@@ -99,14 +103,22 @@ public:
     const LargeClusters& getLargeClusters() const {
         return large;
     }
+    /** The clusters with expressions; there must be some. */
+    const ExpressionClusters& getExpressionClusters() const {
+        return expressions->getClusters();
+    }
     /** Launches since the beginning. */
     long long getNumLaunches() const {
         return numLaunches;
     }
 
 private:
-    DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters);
+    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+                std::unique_ptr<ExpressionSteps>&& expressions);
+    DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters,
+                std::unique_ptr<ExpressionSteps>&& expressions);
     struct Kernels {
+        ExpressionSteps::Kernels expressions;
         OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
         OpenMM::ComputeKernel finishLarge, tryLarge, advanceLarge;
     };
@@ -129,6 +141,7 @@ private:
     Report undo(int numSteps, bool hasSums);
     Report fill(const std::vector<double>& block);
     OpenMM::ComputeContext& context;
+    std::unique_ptr<ExpressionSteps> expressions; // or null
     std::vector<ClusterKind> kinds;
     LargeClusters large;
     Settings settings;
@@ -136,7 +149,7 @@ private:
     bool isMixed, isWide; // mixed is double; there are doubles
     int groupSize;
     int numGroups; // of work, each of which leaves its sums
-    int numPartials; // with the pieces of large clusters, which leave theirs behind
+    int numPartials; // with the parts that have expressions and the pieces of large clusters, which leave theirs behind
     int numFused; // pieces among the work groups of the small clusters
     unsigned numLargeLaunches;
     long long numLaunches;

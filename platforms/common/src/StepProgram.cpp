@@ -19,6 +19,8 @@ namespace {
 
 const int MANY_ENTRIES = 16; // of the matrix of Newton's iteration
 const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
+// Of a part with expressions: where so many chord iterations do not converge Newton's follow.
+const int MAX_CHORD_ITERATIONS = 12, MAX_PART_ITERATIONS = 100;
 // Of a group that waits for others, about 0.2 s; they come within microseconds.
 const int MAX_POLLS = 1 << 18;
 
@@ -138,16 +140,22 @@ bool StepProgram::usesSpeeds(const vector<StepMonitor::Term>& terms) {
 }
 
 StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& large,
-                         const vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide) :
-        numMonitors((int) terms.size()), update(update) {
+                         const ExpressionClusters* expressions, int numThreads, const vector<StepMonitor::Term>& terms,
+                         Update update, bool isMixed, bool isWide) : numMonitors((int) terms.size()), update(update) {
+    const bool areShared = !large.isEmpty() || expressions != nullptr;
+    if (areShared)
+        defines["NUM_THREADS"] = to_string(numThreads);
     writeMonitors(terms);
     writeClusters(kinds);
     writeLargeClusters(large);
+    words["EXPRESSION_CLUSTERS"] = "";
+    if (expressions != nullptr)
+        writeExpressions(*expressions);
     writeAutomaticControl((int) large.getPieces().size());
     source = DeviceSources::step;
     for (const auto& word : words)
         replaceAll(source, word.first, word.second);
-    const map<string, int> numbers = {{"GROUP_SIZE", getGroupSize(!large.isEmpty())},
+    const map<string, int> numbers = {{"GROUP_SIZE", getGroupSize(areShared)},
                                       {"FIXED", Fixed},
                                       {"SUM", Sum},
                                       {"BOUNDED", Bounded},
@@ -358,7 +366,6 @@ void StepProgram::writeLargeClusters(const LargeClusters& large) {
     if (large.isEmpty())
         return;
     const bool hasNarrow = large.getNarrow() > 0;
-    defines["NUM_THREADS"] = to_string(large.getNumThreads());
     defines["USE_RECORDS"] = form.areRecords ? "1" : "0";
     defines["HAS_JOINTS"] = form.hasJoints ? "1" : "0";
     defines["IN_LOCAL_MEMORY"] = form.isInLocalMemory ? "1" : "0";
@@ -395,4 +402,14 @@ void StepProgram::writeAutomaticControl(int numPieces) {
     defines["LENGTH_WEIGHT"] = literal(1 / AutomaticControl::LENGTH);
     defines["FLIGHT_WEIGHT"] = literal(1 / (AutomaticControl::FLIGHT * AutomaticControl::FLIGHT));
     defines["CHANGE_WEIGHT"] = literal(AutomaticControl::CHANGE_WEIGHT);
+}
+
+void StepProgram::writeExpressions(const ExpressionClusters& expressions) {
+    string& text = words["EXPRESSION_CLUSTERS"];
+    text = DeviceSources::expression;
+    replaceAll(text, "EXPRESSION_FUNCTIONS", expressions.writeFunctions());
+    defines["EXPRESSION_LENGTH"] = literal(ConstraintSystem::EXPRESSION_LENGTH);
+    defines["MAX_CHORD_ITERATIONS"] = to_string(MAX_CHORD_ITERATIONS);
+    defines["SMALLEST_SHARE"] = "1e-4f";
+    defines["MAX_PART_ITERATIONS"] = to_string(MAX_PART_ITERATIONS);
 }

@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_STEPPROGRAM_H_
 
 #include "ClusterKinds.h"
+#include "ExpressionClusters.h"
 #include "LargeClusters.h"
 #include "step/AutomaticControl.h"
 #include "step/StepDensity.h"
@@ -78,17 +79,20 @@ public:
 
     /**
      * @param kinds         the clusters that one thread can have
-     * @param large         the others
+     * @param large         those of more distances
+     * @param expressions   those with constraints given as expressions, or null
+     * @param numThreads    of a group that works on one of the last two
      * @param terms         the monitors; none with automatic step control
      * @param update        how the density is found
      * @param isMixed       whether positions and velocities are in double precision
      * @param isWide        whether the device has doubles
      */
     StepProgram(const std::vector<ClusterKind>& kinds, const LargeClusters& large,
-                const std::vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide);
+                const ExpressionClusters* expressions, int numThreads, const std::vector<StepMonitor::Term>& terms,
+                Update update, bool isMixed, bool isWide);
     /** The threads of a work group. */
-    static int getGroupSize(bool hasLargeClusters) {
-        return hasLargeClusters ? 128 : 64;
+    static int getGroupSize(bool hasSharedClusters) {
+        return hasSharedClusters ? 128 : 64;
     }
     /** The update as a device sees it: what does not depend on velocities needs no iteration. */
     static Update updateOf(const std::vector<StepMonitor::Term>& terms, bool isFixedStep, StepDensity::Update update);
@@ -128,6 +132,7 @@ private:
     void writeClusters(const std::vector<ClusterKind>& kinds);
     void writeLargeClusters(const LargeClusters& large);
     void writeAutomaticControl(int numPieces);
+    void writeExpressions(const ExpressionClusters& expressions);
     std::string source;
     std::map<std::string, std::string> defines, words;
     std::vector<Place> places;

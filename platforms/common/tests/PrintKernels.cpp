@@ -3,12 +3,13 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, which needs no monitor), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other), "dense" (many bonds on one particle), or
-// "rare" with the number of a graph of up to eight constraints, for that alone.
+// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other), "dense" (many bonds on one particle),
+// "expressions" (angles, and all functions), or "rare" with the number of a graph of up to eight constraints, for that alone.
 
 #include "StepProgram.h"
 #include "TestSupport.h"
 #include <fstream>
+#include <memory>
 
 using namespace OpenMMVRattle;
 using std::string;
@@ -16,7 +17,8 @@ using std::vector;
 
 int main(int argc, char** argv) {
     if (argc != 5) {
-        std::cerr << "PrintKernels <precision> <monitor> <update> common|large|dense|rare<number>" << std::endl;
+        std::cerr << "PrintKernels <precision> <monitor> <update> common|large|dense|expressions|rare<number>"
+                  << std::endl;
         return 2;
     }
     const string precision = argv[1], graphs = argv[4];
@@ -67,11 +69,26 @@ int main(int argc, char** argv) {
         terms.push_back({(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1});
     const StepProgram::Update update =
         isAutomatic ? StepProgram::Automatic : StepProgram::updateOf(terms, false, (StepDensity::Update) updateNumber);
-    const ClusterKinds kinds(system);
+    vector<ExpressionConstraint> expressions;
+    if (graphs == "expressions") {
+        expressions.push_back({"acos(d/sqrt(a*b))-angle; a=(x1-x2)^2+(y1-y2)^2+(z1-z2)^2;"
+                               " b=(x3-x2)^2+(y3-y2)^2+(z3-z2)^2; d=(x1-x2)*(x3-x2)+(y1-y2)*(y3-y2)+(z1-z2)*(z3-z2)",
+                               {3, 4, 5},
+                               {{"angle", 1.9}}});
+        expressions.push_back({"x1^2.5+x1^y1+exp(x1)+log(y1)+sin(x1)+cos(y1)+sec(x1)+csc(y1)+tan(x1)+cot(y1)+asin(x1)"
+                               "+acos(y1)+atan(x1)+atan2(x1,y1)+sinh(x1)+cosh(y1)+tanh(x1)+erf(y1)+erfc(x1)+step(x1)"
+                               "+delta(y1)+min(x1,y1)+max(x1,y1)+abs(z1)+floor(x1)+ceil(y1)+select(z1,x1,1/0+y1)",
+                               {0},
+                               {}});
+    }
+    const std::unique_ptr<ExpressionClusters> clusters(
+        expressions.empty() ? nullptr : new ExpressionClusters(system, expressions));
+    const ClusterKinds kinds(system, clusters == nullptr ? vector<char>() : clusters->getMembers());
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
     const LargeClusters large(kinds.large,
                               {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
-    const StepProgram program(kinds.small, large, terms, update, precision != "single", true);
+    const StepProgram program(kinds.small, large, clusters.get(), StepProgram::getGroupSize(true), terms, update,
+                              precision != "single", true);
     for (const auto& define : program.getDefines())
         std::cout << "#define " << define.first << " " << define.second << "\n";
     std::cout << program.getSource();

@@ -9,6 +9,7 @@
 #include "openmm/AndersenThermostat.h"
 #include "openmm/CMMotionRemover.h"
 #include "openmm/CompoundIntegrator.h"
+#include "openmm/CustomCompoundBondForce.h"
 #include "openmm/MonteCarloBarostat.h"
 #include "openmm/serialization/XmlSerializer.h"
 
@@ -79,10 +80,21 @@ struct Box : TestSystem {
     }
 };
 
+typedef vector<std::pair<std::string, vector<int>>> Expressions; // and their particles; the parameters are those of all
+
 struct On {
     Integrator_ integrator;
     Context context;
-    On(const TestSystem& t, Platform& platform) : integrator(0.001), context(t.system, integrator, platform) {
+    On(const TestSystem& t, Platform& platform, const Expressions& expressions = {},
+       const vector<std::map<std::string, double>>& parameters = {}) :
+            integrator(makeIntegrator(expressions, parameters)), context(t.system, integrator, platform) {
+    }
+    static Integrator_ makeIntegrator(const Expressions& expressions,
+                                      const vector<std::map<std::string, double>>& parameters) {
+        Integrator_ result(0.001);
+        for (size_t i = 0; i < expressions.size(); i++)
+            result.addConstraint(expressions[i].first, expressions[i].second, parameters[i]);
+        return result;
     }
     vector<Vec3> positions() {
         return context.getState(State::Positions).getPositions();
@@ -342,6 +354,149 @@ void testFailureInTheMiddle() {
     ASSERT_EQUAL(withoutNumbers(messages[0]), withoutNumbers(messages[1]));
 }
 
+// A rod as in section 5 of the paper, of sections of three particles that distances keep rigid, joined to their neighbours by three
+// expressions, which bends and twists: K is block tridiagonal. The first section does not move.
+struct Rod : TestSystem {
+    Expressions expressions;
+    vector<std::map<std::string, double>> parameters;
+
+    explicit Rod(int sections) {
+        const double spacing = 0.1, offset = 0.3;
+        const Vec3 shape[] = {Vec3(offset, 0, 0), Vec3(0, offset, 0), Vec3(-offset, -offset, 0)};
+        std::string means;
+        for (const char* axis : {"x", "y", "z"}) {
+            const std::string a(axis), first = "c" + a + "a", second = "c" + a + "b";
+            for (const char* k : {"1", "2"})
+                means += "; m" + (k + a) + "=(" + a + k + "-" + first + "+" + a + std::to_string(std::stoi(k) + 3) +
+                         "-" + second + ")/(2*offset)";
+        }
+        std::string centres;
+        for (const char* axis : {"x", "y", "z"}) {
+            const std::string a(axis);
+            centres +=
+                "; c" + a + "a=(" + a + "1+" + a + "2+" + a + "3)/3; c" + a + "b=(" + a + "4+" + a + "5+" + a + "6)/3";
+        }
+        const std::string rest = means + centres;
+        auto* elasticity = new CustomCompoundBondForce(
+            6, "0.05*(0.1*u1^2+0.1*u2^2+0.4*u3^2); u1=nx*e2x+ny*e2y+nz*e2z; u2=-(nx*e1x+ny*e1y+nz*e1z);"
+               " u3=m2x*e1x+m2y*e1y+m2z*e1z; nx=m1y*m2z-m1z*m2y; ny=m1z*m2x-m1x*m2z; nz=m1x*m2y-m1y*m2x;"
+               " e1x=(x4-cxb-x1+cxa)/d; e1y=(y4-cyb-y1+cya)/d; e1z=(z4-czb-z1+cza)/d;"
+               " e2x=(x5-cxb-x2+cxa)/d; e2y=(y5-cyb-y2+cya)/d; e2z=(z5-czb-z2+cza)/d; d=0.03" +
+                   rest + "; offset=0.3");
+        for (int section = 0; section < sections; section++)
+            for (int i = 0; i < 3; i++) {
+                const double along = spacing * section, phase = 0.02 * section;
+                system.addParticle(section == 0 ? 0.0 : spacing / 3);
+                positions.push_back(shape[i] + Vec3(0, 0, along));
+                velocities.push_back(
+                    section == 0 ? Vec3()
+                                 : Vec3(1.5 * (1 - std::cos(phase)), std::sin(3 * phase), 0.5 * std::sin(phase)));
+                if (section == 0)
+                    continue;
+                const int first = 3 * section + i, second = 3 * section + (i + 1) % 3;
+                const Vec3 r = shape[i] - shape[(i + 1) % 3];
+                system.addConstraint(first, second, std::sqrt(r.dot(r)));
+            }
+        const std::string components[] = {"m1y*m2z-m1z*m2y", "m1z*m2x-m1x*m2z", "m1x*m2y-m1y*m2x"};
+        for (int section = 0; section + 1 < sections; section++) {
+            vector<int> particles;
+            for (int i = 0; i < 6; i++)
+                particles.push_back(3 * section + i);
+            elasticity->addBond(particles, {});
+            for (int d = 0; d < 3; d++) {
+                const std::string a(1, (char) ('x' + d));
+                expressions.emplace_back("(c" + a + "b-c" + a + "a)/spacing-(" + components[d] + ")" + rest, particles);
+                parameters.push_back({{"spacing", spacing}, {"offset", offset}});
+            }
+        }
+        system.addForce(elasticity);
+    }
+};
+
+void testRod() {
+    if (precision() !=
+        "double") // forces are differences of positions as large as 100 nm, which a float gives no digits
+        return;
+    const Rod t(1000);
+    On here(t, getTestPlatform(), t.expressions, t.parameters), there(t, reference(), t.expressions, t.parameters);
+    for (On* each : {&here, &there}) {
+        each->integrator.setUpdateMethod(Integrator_::Explicit);
+        each->integrator.setStepSize(0.002);
+        each->integrator.setConstraintTolerance(1e-12);
+        each->context.setPositions(t.positions);
+        each->context.setVelocities(t.velocities);
+        each->integrator.step(100);
+    }
+    ASSERT(largestDifference(t.positions, there.positions()) > 0.01);
+    ASSERT(largestDifference(there.positions(), here.positions()) <= 1e-9);
+    ASSERT_EQUAL_TOL(there.integrator.getStepDensity(), here.integrator.getStepDensity(), 1e-8);
+    const vector<double> expected = there.integrator.getMultipliers(), found = here.integrator.getMultipliers();
+    for (size_t k = 0; k < expected.size(); k++)
+        ASSERT(std::fabs(found[k] - expected[k]) <= 1e-6 * largestOf(expected));
+}
+
+// Expressions are not periodic: where OpenMM moves molecules by box vectors, and changes the places of identical ones, they are of
+// the positions that users see, and each stays with its own molecule.
+void testExpressionsInABox() {
+    TestSystem t;
+    const double edge = 2.2;
+    t.system.setDefaultPeriodicBoxVectors(Vec3(edge, 0, 0), Vec3(0.4, edge, 0), Vec3(-0.3, 0.5, edge));
+    auto* nonbonded = new NonbondedForce(); // with which OpenMM sorts molecules; they do not act on each other
+    nonbonded->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
+    nonbonded->setCutoffDistance(1.0);
+    auto* field = new CustomExternalForce("-3*x+2*z");
+    Expressions expressions;
+    vector<std::map<std::string, double>> parameters;
+    auto add = [&](double mass, const Vec3& position, const Vec3& velocity) {
+        t.positions.push_back(position);
+        t.velocities.push_back(velocity);
+        nonbonded->addParticle(0, 0.1, 0);
+        const int index = t.system.addParticle(mass);
+        field->addParticle(index);
+        return index;
+    };
+    for (int i = 0; i < 24; i++) { // dumbbells, of which two have another length
+        const double length = i == 5 || i == 17 ? 0.15 : 0.1;
+        const Vec3 centre(0.37 * i, 0.21 * (i % 7), 0.33 * (i % 5)),
+            velocity(2 - 0.3 * i, 1.5 * std::sin(i), 4 * std::cos(i));
+        const int first = add(4, centre, velocity), second = add(4, centre + Vec3(0, length, 0), velocity * 0.8);
+        expressions.emplace_back("sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-r", vector<int>{first, second});
+        parameters.push_back({{"r", length}});
+    }
+    for (int i = 0; i < 6; i++) { // on rings that are wider than the box
+        const double angle = i;
+        expressions.emplace_back("x1^2+y1^2-r",
+                                 vector<int>{add(3, Vec3(1.5 * std::cos(angle), 1.5 * std::sin(angle), 0),
+                                                 Vec3(-5 * std::sin(angle), 5 * std::cos(angle), 2))});
+        parameters.push_back({{"r", 2.25}});
+    }
+    // Two molecules with distances of their own, far from each other.
+    const int one = add(4, Vec3(0, 0.05, 0.05), Vec3(3, 1, 0)), other = add(2, Vec3(0.1, 0.05, 0.05), Vec3(3, 2, 0));
+    const int far = add(4, Vec3(4, 0.3, 1), Vec3(2, 3, -5)), last = add(2, Vec3(4.1, 0.3, 1), Vec3(2, 3, -5));
+    t.system.addConstraint(one, other, 0.1);
+    t.system.addConstraint(far, last, 0.1);
+    expressions.emplace_back("x1+y1+z1-x2-y2-z2+r", vector<int>{one, far});
+    parameters.push_back({{"r", 5.2}});
+    t.system.addForce(nonbonded);
+    t.system.addForce(field);
+    On here(t, getTestPlatform(), expressions, parameters), there(t, reference(), expressions, parameters);
+    for (On* each : {&here, &there}) {
+        each->integrator.setConstraintTolerance(choose(1e-11, 1e-10, 1e-5));
+        each->context.setPositions(t.positions);
+        each->context.setVelocities(t.velocities);
+        each->integrator.step(900); // OpenMM sorts every 250 steps
+    }
+    ASSERT(largestDifference(t.positions, there.positions()) > 1.5 * edge);
+    ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-8, 1e-3, 1e-1));
+    // Other lengths for molecules that were identical: what follows knows which is which.
+    for (On* each : {&here, &there}) {
+        for (int i : {2, 9})
+            each->integrator.setExpressionConstraintParameter(i, "r", 0.1002 + 0.0001 * i);
+        each->integrator.step(600);
+    }
+    ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-7, 1e-2, 1));
+}
+
 } // namespace
 
 int main(int argc, char** argv) {
@@ -352,6 +507,8 @@ int main(int argc, char** argv) {
                           {"a barostat", [] { testBarostat(false); }},
                           {"a barostat and automatic step control", [] { testBarostat(true); }},
                           {"thermostats and automatic step control", testAutomaticControlUnderThermostats},
-                          {"a failure in the middle of a block", testFailureInTheMiddle}},
+                          {"a failure in the middle of a block", testFailureInTheMiddle},
+                          {"a rod of expressions and distances", testRod},
+                          {"expressions in a periodic box", testExpressionsInABox}},
                          argc, argv);
 }

@@ -34,6 +34,8 @@ CASES = (
         (precision, CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, kind, ("sm_90",))
         for precision, kind in (("mixed", "rare4"), ("double", "rare6"), ("mixed", "rare8"), ("double", "rare11"))
     ),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "expressions", ("sm_70", "sm_90")),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "expressions", ("sm_90",)),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.
@@ -114,7 +116,8 @@ def main(print_kernels: str) -> int:
             )
             assert {"finishStep", "advanceStep"} <= {kernel[0] for kernel in kernels}, report
             for name, stack, spills, registers in kernels:
-                failed = int(stack) > 0 or int(spills) > 0
+                # Those with expressions have their numbers in global memory.
+                failed = not name.endswith("Expressions") and (int(stack) > 0 or int(spills) > 0)
                 num_failed += failed
                 print(
                     f"{'FAILED' if failed else 'passed'}: {precision} update {update} {graphs} {architecture} {name}: "

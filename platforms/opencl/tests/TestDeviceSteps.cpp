@@ -4,7 +4,9 @@
 // The steps on a device against VRattleDynamics, from the same state in the middle of a run.
 
 #include "DeviceSteps.h"
+#include "ExpressionCode.h"
 #include "TestSupport.h"
+#include "expressions/ExpressionGroup.h"
 #include "openmm/Context.h"
 #include "openmm/CustomExternalForce.h"
 #include "openmm/HarmonicBondForce.h"
@@ -58,6 +60,7 @@ struct Molecules {
     vector<Vec3> positions, velocities;
     vector<double> masses;
     vector<DistanceConstraint> constraints;
+    vector<ExpressionConstraint> expressions;
     std::mt19937 random;
 
     OpenMM::CustomExternalForce* field;
@@ -134,6 +137,19 @@ struct Molecules {
         positions.push_back(position);
         velocities.push_back(Vec3(normal(random), normal(random), normal(random)));
     }
+    // An expression is held at what it is.
+    void addExpression(const std::string& expression, const vector<int>& particles) {
+        ExpressionConstraint constraint = {"-held + " + expression, particles, {{"held", 0.0}}};
+        ExpressionGroup group(constraint);
+        group.add(constraint, 0, 0, 0, vector<double>(masses.size(), 1.0));
+        group.compile();
+        vector<double> value(1);
+        ExpressionParameters atRest;
+        atRest.values = atRest.rates = {0.0};
+        group.evaluate(positions, atRest, value, 0, 1);
+        constraint.parameters["held"] = value[0];
+        expressions.push_back(constraint);
+    }
     void addConstraint(int i, int j) {
         const Vec3 r = positions[i] - positions[j];
         system.addConstraint(i, j, std::sqrt(r.dot(r)));
@@ -161,8 +177,8 @@ struct Both {
 
     Both(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
-            dynamics(molecules.masses, molecules.constraints), device(lender.getDevice(), molecules.system),
-            settings() {
+            dynamics(molecules.masses, molecules.constraints, molecules.expressions),
+            device(lender.getDevice(), molecules.system, molecules.expressions), settings() {
     }
     // Some steps on the host, then the state goes to the device.
     void start(const Molecules& molecules, StepDensity::Update update, const vector<StepMonitor::Term>& terms) {
@@ -403,6 +419,54 @@ Molecules makeMolecules(const vector<Bonds>& large) {
     return molecules;
 }
 
+const char ANGLE[] = "acos(d/sqrt(a*b)); a=(x1-x2)^2+(y1-y2)^2+(z1-z2)^2; b=(x3-x2)^2+(y3-y2)^2+(z3-z2)^2;"
+                     " d=(x1-x2)*(x3-x2)+(y1-y2)*(y3-y2)+(z1-z2)*(z3-z2)";
+const char DISTANCE[] = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)";
+const char DIFFERENCE[] = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2) - sqrt((x3-x4)^2+(y3-y4)^2+(z3-z4)^2)";
+
+// Expressions of many kinds: alone, with distances, with a particle that has no mass, of many particles, and in a large cluster.
+Molecules makeExpressions() {
+    Molecules molecules(0);
+    const int fixed = (int) molecules.masses.size() - 1; // has no mass
+    auto addCoil = [&](int length) {
+        const int first = (int) molecules.masses.size();
+        molecules.addLarge(makeChain(length));
+        return first;
+    };
+    auto addFree = [&](int count) {
+        const int first = (int) molecules.masses.size();
+        for (int i = 0; i < count; i++) {
+            molecules.addParticle(3 + i, Vec3(0.3 * std::cos(1.7 * i) - 0.2, 0.3 * std::sin(1.7 * i), 0.05 * i));
+            molecules.field->addParticle(first + i);
+        }
+        return first;
+    };
+    const int pendulum = addFree(3);
+    molecules.addExpression(DISTANCE, {pendulum, fixed});
+    molecules.addExpression(DISTANCE, {fixed, pendulum + 1});
+    molecules.addExpression("x1^2+0.3*y1*z1", {pendulum + 2});
+    molecules.addExpression("select(step(x1-5), log(-1-x1^2), tanh(x1+2*z1)*erf(y1)^3)", {pendulum + 2});
+    const int angle = addFree(3);
+    molecules.addExpression(ANGLE, {angle, angle + 1, angle + 2});
+    const int rigid = addCoil(3);
+    molecules.addExpression(ANGLE, {rigid, rigid + 1, rigid + 2});
+    molecules.addExpression(DIFFERENCE, {rigid, rigid + 2, rigid + 1, rigid + 3});
+    const int chain = addCoil(60);
+    for (int i = 0; i < 58; i += 4)
+        molecules.addExpression(ANGLE, {chain + i, chain + i + 1, chain + i + 2});
+    molecules.addExpression(DIFFERENCE, {chain, chain + 60, chain + 20, chain + 40});
+    const int cloud = addFree(40);
+    std::string sum = "0";
+    vector<int> members;
+    for (int i = 0; i < 40; i++) {
+        sum += "+x" + std::to_string(i + 1);
+        members.push_back(cloud + i);
+    }
+    molecules.addExpression(sum, members);
+    molecules.addLarge(makeChain(2)); // without
+    return molecules;
+}
+
 const vector<StepDensity::Update> UPDATES = {StepDensity::SemiExplicit, StepDensity::Explicit, StepDensity::Bounded};
 
 void testDiamond() {
@@ -470,6 +534,85 @@ void testNumLaunches() {
         ASSERT(!both.device.read().hasFailed);
         const double perStep = (double) (both.device.getNumIterations() - iterations) / 10;
         ASSERT(perStep >= 1 && perStep <= 8);
+    }
+}
+
+// The same with expressions, how they are divided, and in how many levels they are eliminated.
+void testDivisionOfExpressions() {
+    const Molecules molecules = makeExpressions();
+    Both both(molecules, "double");
+    both.start(molecules, StepDensity::Explicit, allMonitors());
+    const long long before = both.device.getNumLaunches(), iterations = both.device.getNumIterations();
+    for (int i = 0; i < 10; i++)
+        both.stepOnDevice();
+    ASSERT_EQUAL(10 * 4, both.device.getNumLaunches() - before);
+    ASSERT(!both.device.read().hasFailed);
+    const double perStep = (double) (both.device.getNumIterations() - iterations) / 10;
+    ASSERT(perStep >= 1 && perStep <= 8);
+    const ExpressionClusters& clusters = both.device.getExpressionClusters();
+    ASSERT_EQUAL(1, clusters.getParts().size()); // of 88 constraints
+    // A ladder: sections of two particles that a distance joins, each joined to the next by two expressions. As a chain it halves in
+    // each round, of up to three constraints that are coupled.
+    System ladder;
+    vector<ExpressionConstraint> rungs;
+    const int length = 1000;
+    for (int i = 0; i < length; i++) {
+        ladder.addParticle(1);
+        ladder.addParticle(1);
+        ladder.addConstraint(2 * i, 2 * i + 1, 0.1);
+        for (int k = 0; k < (i > 0 ? 2 : 0); k++)
+            rungs.push_back({"x1-x2-z3*y4+shift", {2 * i - 2, 2 * i - 1, 2 * i, 2 * i + 1}, {{"shift", 0.1 * k}}});
+    }
+    const ExpressionClusters chain(ladder, rungs);
+    ASSERT_EQUAL(1, chain.getParts().size());
+    ASSERT_EQUAL(3 * length - 2, chain.getNumConstraints());
+    ASSERT(chain.getNumLevels() <= 60);
+    ASSERT(chain.getNumFactorEntries() <= (size_t) 40 * length);
+    // Small clusters share a work group.
+    System pendulums;
+    vector<ExpressionConstraint> spheres;
+    for (int i = 0; i < 1000; i++)
+        spheres.push_back({"x1^2+y1^2+z1^2-1", {pendulums.addParticle(1)}, {}});
+    const ExpressionClusters many(pendulums, spheres);
+    ASSERT_EQUAL(8, many.getParts().size());
+    ASSERT_EQUAL(1, many.getNumLevels());
+}
+
+// A long chain that is nearly straight moves across itself: there the chord iteration does not contract. In a cluster with an expression
+// Newton's follows on the device; without, the step is the host's.
+void testNewton() {
+    for (bool hasExpression : {false, true}) {
+        Molecules molecules(0);
+        const int length = 150, first = (int) molecules.masses.size();
+        vector<Vec3> straight;
+        for (int i = 0; i <= length; i++)
+            straight.push_back(Vec3(0.13 * (i - length / 2), 1e-3 * std::sin(i), 1e-3 * std::cos(2 * i)));
+        molecules.addLarge(makeChain(length), 12, straight);
+        for (int i = first; i <= first + length; i++)
+            molecules.velocities[i] *= 3;
+        if (hasExpression)
+            molecules.addExpression("x1*y1", {first});
+        Both both(molecules, "double");
+        both.settings = {0.001, 0, 0, 1e-10, StepDensity::Explicit, {}, false};
+        both.dynamics.setSettings(both.settings);
+        const vector<Vec3> forces = both.forcesAt(molecules.positions);
+        both.dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
+        both.context.setPositions(both.dynamics.getPositions());
+        both.context.setVelocities(both.dynamics.getVelocities());
+        both.computeForces();
+        both.device.setSettings(
+            {0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-10, {}});
+        ASSERT(both.device.begin({1, 0, false, 0}, 0));
+        both.stepOnDevice();
+        const DeviceSteps::Report report = both.device.read();
+        ASSERT_EQUAL(!hasExpression, report.hasFailed);
+        if (!hasExpression)
+            continue;
+        ASSERT(both.device.getNumIterations() >= 3);
+        const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+        both.stepOnHost();
+        ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= 1e-9);
+        ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1e-6);
     }
 }
 
@@ -717,10 +860,97 @@ void testFailureOfAutomaticControl(const std::string& precision) {
     }
 }
 
+// What is written for the device against what the host evaluates: every operation, and all derivatives.
+void testExpressionCode() {
+    const vector<std::string> texts = {"x1^2.5+x1^y2+k^x1+x1^21+x1^(-3)",
+                                       "exp(x1)*log(y2)-sin(x1*z2)*cos(y2+k)",
+                                       "sec(x1)+csc(y2)+tan(x1*y2)+cot(y2)+asin(0.3*x1)+acos(0.4*y2)",
+                                       "atan(x1*y2)+atan2(x1,y2)*atan2(k,z2)",
+                                       "sinh(x1)*cosh(y2)/tanh(z2+k)+erf(x1)*erfc(y2)",
+                                       "step(x1-y2)*x1+delta(x1-x1)*y2^3+min(x1,y2)*max(y2,k)*abs(-z2)",
+                                       "floor(5*x1)*y2+ceil(5*y2)*x1^3",
+                                       "select(step(-x1), sqrt(-x1), x1^2*y2) + select(x1, y2^3, 1/(y2-y2))",
+                                       "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-k*shift^2",
+                                       "x1*y1*z1*x2*y2*z2*k*shift-1e-3/(1/0)"};
+    const vector<Vec3> q = {Vec3(0.7, 0.3, -0.4), Vec3(0, 0, 0), Vec3(0.5, 0.9, 1.3)},
+                       v = {Vec3(0.2, -0.6, 1.1), Vec3(0, 0, 0), Vec3(-0.8, 0.5, 0.3)};
+    const ExpressionParameters theta = {{0.8, 0.6}, {0.3, -0.2}, true}, atRest = {theta.values, {0, 0}, false};
+    const int numResults = 10, numTexts = (int) texts.size();
+    std::string source, calls;
+    vector<double> expected;
+    for (int i = 0; i < numTexts; i++) {
+        const ExpressionConstraint constraint = {texts[i], {0, 2}, {{"k", 0.8}, {"shift", 0.6}}};
+        const std::string kind = "_E" + std::to_string(i), result = "results+" + std::to_string(numResults * i);
+        source += ExpressionCode(ExpressionDerivatives(constraint)).write(kind);
+        calls += "*(" + result + ") = value" + kind + "(x, at, theta);\n*(" + result + "+1) = motion" + kind +
+                 "(x, at, theta, rates, 0.5);\n*(" + result + "+2) = curvature" + kind + "(x, v, at, theta);\n*(" +
+                 result + "+3) = movingCurvature" + kind + "(x, v, at, theta, rates, 0.5);\ngradient" + kind +
+                 "(x, at, theta, " + result + "+4);\n";
+        ExpressionGroup group(constraint);
+        group.add(constraint, 0, 0, 0, {1, 1, 1});
+        group.compile();
+        vector<double> value(1), motion(1, 0.0), curvature(1), moving(1);
+        vector<Vec3> gradient(2);
+        group.evaluate(q, atRest, value, 0, 1);
+        group.addParameterMotion(q, theta, motion, 0, 1);
+        group.evaluateCurvature(q, v, atRest, curvature, 0, 1);
+        group.evaluateCurvature(q, v, theta, moving, 0, 1);
+        group.evaluateJacobian(q, atRest, gradient, 0, 1);
+        expected.insert(expected.end(), {value[0], motion[0], curvature[0], moving[0]});
+        for (const Vec3& entry : gradient)
+            expected.insert(expected.end(), {entry[0], entry[1], entry[2]});
+    }
+    source += "KERNEL void evaluate(GLOBAL const mixed* x, GLOBAL const mixed* v, GLOBAL const int* at, GLOBAL const "
+              "mixed* theta, GLOBAL const mixed* rates, GLOBAL mixed* results) {\n" +
+              calls + "}\n";
+    System system;
+    system.addParticle(1);
+    Lender lender;
+    Context context(system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", "double"}});
+    OpenMM::ComputeContext& device = lender.getDevice();
+    OpenMM::ComputeKernel kernel = device.compileProgram(source)->createKernel("evaluate");
+    auto flatten = [](const vector<Vec3>& vectors) {
+        vector<double> numbers;
+        for (const Vec3& each : vectors)
+            numbers.insert(numbers.end(), {each[0], each[1], each[2]});
+        return numbers;
+    };
+    OpenMM::ComputeArray arrays[6];
+    const vector<double> inputs[] = {flatten(q), flatten(v), {}, theta.values, {0.6, -0.4}, expected};
+    for (int i = 0; i < 6; i++)
+        if (i == 2) {
+            arrays[i].initialize<int>(device, 2, "places");
+            arrays[i].upload(vector<int>{0, 2});
+        }
+        else {
+            arrays[i].initialize<double>(device, inputs[i].size(), "numbers");
+            arrays[i].upload(inputs[i]);
+        }
+    for (OpenMM::ComputeArray& array : arrays)
+        kernel->addArg(array);
+    device.clearBuffer(arrays[5]);
+    kernel->execute(1, 1);
+    vector<double> found;
+    arrays[5].download(found);
+    for (size_t i = 0; i < expected.size(); i++)
+        if (!(std::fabs(found[i] - expected[i]) <= 1e-12 * (1 + std::fabs(expected[i]))))
+            throw OpenMM::OpenMMException(texts[i / numResults] + ": number " + std::to_string(i % numResults) +
+                                          " is " + std::to_string(found[i]) + " in place of " +
+                                          std::to_string(expected[i]));
+}
+
 // Which constraints the device solves, and which are left to the host.
 void testWhatItTakes() {
     ASSERT(DeviceSteps::canTake({}));
-    ASSERT(!DeviceSteps::canTake({{"x1^2+y1^2+z1^2-1", {0}, {}}}));
+    ASSERT(DeviceSteps::canTake({{"x1^2+y1^2+z1^2-1", {0}, {}}}));
+    // Compilers would take minutes for what is as long as this.
+    std::string sum = "x1";
+    vector<int> particles = {0};
+    for (int i = 1; i < 1500; i++) {
+        sum += "+sin(x" + std::to_string(i + 1) + ")";
+        particles.push_back(i);
+    }
+    ASSERT(!DeviceSteps::canTake({{sum, particles, {}}}));
 }
 
 } // namespace
@@ -763,6 +993,15 @@ int main(int argc, char** argv) {
         {"dependent constraints, mixed", [] { testDependentConstraints("mixed"); }},
         {"division into pieces", testDivision},
         {"launches", testNumLaunches},
+        {"expressions agree, double",
+         [] {
+             testStepsAgree(makeExpressions(), "double", {StepDensity::SemiExplicit, StepDensity::Explicit}, 1e-12,
+                            1e-9);
+         }},
+        {"expressions agree, mixed",
+         [] { testStepsAgree(makeExpressions(), "mixed", {StepDensity::Explicit}, 1e-9, 1e-6); }},
+        {"division and launches of expressions", testDivisionOfExpressions},
+        {"Newton's iteration with expressions", testNewton},
         {"changed velocities", testChangedVelocities},
         {"automatic step control, double", [] { testAutomaticControl(Molecules(2), "double", 1e-12, 1e-9); }},
         {"automatic step control of large clusters, double",
@@ -775,6 +1014,7 @@ int main(int argc, char** argv) {
         {"a failure of a large cluster in pieces leaves the state before, mixed",
          [] { testFailureLeavesTheStateBefore("mixed", 400); }},
         {"a failure with automatic step control, double", [] { testFailureOfAutomaticControl("double"); }},
+        {"expressions are written as they are evaluated", testExpressionCode},
         {"what it takes", testWhatItTakes}};
     if (argc > 1)
         tests = {tests.at(std::stoi(argv[1]))};

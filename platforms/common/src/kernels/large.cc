@@ -13,25 +13,7 @@
 // NUM_THREADS threads have a piece. MEMORY is where a piece has its numbers and tables: local memory, or global memory if they do not fit, or if they must
 // outlive a launch.
 
-// Where a processor is the device, one thread has a piece.
-#if NUM_THREADS == 1
-#define THREAD 0
-#define SYNC_PIECE
-#define MERGE_SUMS(sums)
-#define LARGE_MEMORY LOCAL mixed buffer[1]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
-#else
-#define THREAD LOCAL_ID
-#define SYNC_PIECE SYNC_THREADS
-#if UPDATE == AUTOMATIC
-#define MERGE_SUMS(sums) addTermsInGroup(sums, buffer)
-#else
-#define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
-#endif
-#define LARGE_MEMORY LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
-#endif
-
-// Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
-#define KEEP_LOOP _Pragma("unroll 1")
+#define LARGE_MEMORY LOCAL mixed buffer[PIECE_SUMS]; LOCAL uint4 memory[SHARED_SIZE]; LOCAL int flags[2];
 
 #define FINISH 0
 #define ADVANCE 1

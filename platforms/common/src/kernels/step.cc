@@ -204,7 +204,31 @@ inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
 
 CLUSTER_FUNCTIONS
 
+// Work groups that work together on what one thread cannot have. Where a processor is the device, one thread has it all.
+#ifdef NUM_THREADS
+#if NUM_THREADS == 1
+#define THREAD 0
+#define SYNC_PIECE
+#define MERGE_SUMS(sums)
+#define PIECE_SUMS 1
+#else
+#define THREAD LOCAL_ID
+#define SYNC_PIECE SYNC_THREADS
+#if UPDATE == AUTOMATIC
+#define MERGE_SUMS(sums) addTermsInGroup(sums, buffer)
+#else
+#define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
+#endif
+#define PIECE_SUMS (NUM_SUMS*GROUP_SIZE)
+#endif
+#endif
+
+// Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
+#define KEEP_LOOP _Pragma("unroll 1")
+
 LARGE_CLUSTERS
+
+EXPRESSION_CLUSTERS
 
 // The work groups that have clusters in single threads, which come behind those that have a piece of a large one.
 #define SMALL_GROUP ((int) GROUP_ID - NUM_FUSED)

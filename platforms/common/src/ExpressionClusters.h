@@ -1,0 +1,93 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+#ifndef OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
+#define OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
+
+#include "expressions/ExpressionDerivatives.h"
+#include "openmm/System.h"
+#include <cstddef>
+#include <map>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace OpenMMVRattle {
+
+/**
+ * The clusters with a constraint that is given as an expression, for kernels/expression.cc: in parts, each of one large cluster or of as
+ * many small ones as keep the threads of a work group busy. A part has one sparse matrix K; which of its rows do not depend on
+ * each other, and are eliminated at once, is in tables that are worked out here, once.
+ *
+ * The distances of such a cluster are rows like others, of the expression (|r|^2 - L^2)/2.
+ */
+class ExpressionClusters {
+public:
+    /** A part has about so many constraints, or one cluster. */
+    static const int PART_SIZE = 128;
+
+    ExpressionClusters(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
+    bool isEmpty() const {
+        return parts.empty();
+    }
+    /** Whether each particle moves and is in such a cluster. */
+    const std::vector<char>& getMembers() const {
+        return isMember;
+    }
+    /** The functions of all expressions (ExpressionCode), and those that choose among them by the kind of a row. */
+    std::string writeFunctions() const;
+    /** The operations in the functions of all expressions together. */
+    static size_t findSize(const std::vector<ExpressionConstraint>& expressions);
+    /** Where the table of each part begins. */
+    const std::vector<int>& getParts() const {
+        return parts;
+    }
+    const std::vector<int>& getTables() const {
+        return tables;
+    }
+    /** The particle of each place; a massless one may be in several parts. */
+    const std::vector<int>& getPlaces() const {
+        return places;
+    }
+    /** The parameters of all rows: lengths, and those of expressions as they were given. */
+    const std::vector<double>& getParameters() const {
+        return parameters;
+    }
+    /** Write the parameters of an expression, by the number that it was given, into the parameters of all rows. */
+    void writeParameters(int expression, const std::map<std::string, double>& values, std::vector<double>& all) const;
+    int getNumConstraints() const {
+        return numConstraints;
+    }
+    /** Numbers that the parts work with. */
+    size_t getNumWork() const {
+        return numWork;
+    }
+    /** The largest numbers among the parts: levels, and entries of the factor below the diagonal. */
+    int getNumLevels() const {
+        return numLevels;
+    }
+    size_t getNumFactorEntries() const {
+        return numFactorEntries;
+    }
+
+private:
+    struct Row;
+    void addPart(const std::vector<Row>& rows, const std::vector<double>& masses);
+    int kindOf(const ExpressionConstraint& constraint);
+    std::vector<char> isMember;
+    std::vector<std::unique_ptr<ExpressionDerivatives>> kinds; // the first is that of distances
+    typedef std::pair<std::string, std::vector<std::string>>
+        Kind; // the expression, the number of particles, names of parameters
+    static Kind nameKind(const ExpressionConstraint& constraint);
+    std::map<Kind, int> numberOfKind;
+    std::vector<int> parts, tables, places;
+    std::vector<int> firstParameters; // of each expression
+    std::vector<double> parameters;
+    int numConstraints, numLevels;
+    size_t numWork, numFactorEntries;
+};
+
+} // namespace OpenMMVRattle
+
+#endif // OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
