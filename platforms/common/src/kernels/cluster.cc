@@ -39,7 +39,7 @@ inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RES
     mixed forceSquared = 1;
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         mixed a[3];
-        forceSquared = loadAcceleration(AGAIN(NUM_CONSTRAINTS > 6 && forceSquared > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], a);
+        forceSquared = loadAcceleration(AGAIN(NUM_CONSTRAINTS > 5 && forceSquared > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], a);
         addParticleTerms(sums, forceSquared, w[i], v[i]);
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
             if (first[k] == i)
@@ -67,7 +67,7 @@ inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mi
 }
 
 // Registers are what clusters of many constraints lack. So what is needed again after a solution is read AGAIN and not kept, and those of
-// seven and more constraints, in which that saves nothing else, read one particle after the other and not all at once.
+// six and more constraints, in which that saves nothing else, read one particle after the other and not all at once.
 
 /** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
 inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
@@ -81,7 +81,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         mixed a[3];
-        const bool isReady = (NUM_CONSTRAINTS > 6 && (i == 0 ? r[0][0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        const bool isReady = (NUM_CONSTRAINTS > 5 && (i == 0 ? r[0][0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         isRegular = loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a) >= 0 && isRegular;
 #if UPDATE == AUTOMATIC
@@ -105,7 +105,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 #if UPDATE == AUTOMATIC
     mixed net[NUM_ATOMS][3]; // M^-1 (F - G^T Lambda)
     UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        addFlight(terms, loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]), v[i]);
+        addFlight(terms, loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 6 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]), v[i]);
     push_KIND(r, w, x1, -1, net);
     UNROLL for (int i = 0; i < NUM_ATOMS; i++)
         addAutomaticTerms(terms, last, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], v[i], net[i]);
@@ -116,7 +116,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
 #if HALF_SUMS
         mixed before[3], a[3];
-        const bool isReady = ((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        const bool isReady = ((i == 0 || NUM_CONSTRAINTS < 6 ? x1[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         loadVelocity(AGAIN(isReady, velm), atom, before);
         loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
 #endif
@@ -138,7 +138,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed dt, mixed* w, mixed (*v)[3]) {
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        const bool isReady = (NUM_CONSTRAINTS > 6 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
+        const bool isReady = (NUM_CONSTRAINTS > 5 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
         mixed a[3];
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
@@ -192,7 +192,7 @@ inline DEVICE int constrain_KIND(int c, mixed dt, mixed tolerance, GLOBAL const 
 inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed* sums) {
     mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 6 && r[0][0] > 0);
+    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
     loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
     const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) // where the next trial starts
@@ -216,7 +216,7 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GL
         oldVelocities[atom] = velm[atom];
     }
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 6 && r[0][0] > 0);
+    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
     loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
     const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) {
