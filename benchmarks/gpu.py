@@ -29,7 +29,11 @@ from typing import Any
 import numpy as np
 import openmm
 from openmm import app, unit
-from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
+from openmmvrattle import (
+    CustomVariableStepRattleIntegrator,
+    VariableStepRattleIntegrator,
+    VariableStepRattleLangevinIntegrator,
+)
 
 Loaded = tuple[openmm.System, np.ndarray]
 GPU_PLATFORMS = ("CUDA", "OpenCL", "HIP")
@@ -226,6 +230,7 @@ def integrators(step: float, state: openmm.State, system: openmm.System, single:
         "Verlet": with_tolerance(lambda: openmm.VerletIntegrator(step), coarse),
         "VariableVerlet": with_tolerance(lambda: openmm.VariableVerletIntegrator(error), coarse),
         "LangevinMiddle": with_tolerance(lambda: openmm.LangevinMiddleIntegrator(300, 1, step), coarse),
+        "Langevin": with_tolerance(lambda: VariableStepRattleLangevinIntegrator(300, 1, step), tolerance),
         "fixed": with_tolerance(lambda: ours(step, monitors=[]), tolerance),
         "Explicit": with_tolerance(lambda: ours(step, ours.Explicit), tolerance),
         "Bounded": with_tolerance(lambda: ours(step, ours.Bounded), tolerance),
@@ -259,6 +264,12 @@ class Run:
 
 def describe(integrator: openmm.Integrator) -> dict[str, Any]:
     """What is to be known of a run of ours."""
+    if isinstance(integrator, VariableStepRattleLangevinIntegrator):
+        return {
+            "force_evaluations": integrator.getNumForceEvaluations(),
+            "solver_iterations": integrator.getNumSolverIterations(),
+            "substepped": integrator.getNumSubstepped(),
+        }
     if not isinstance(integrator, VariableStepRattleIntegrator):
         return {}
     return {
@@ -386,7 +397,7 @@ def measure(name: str, precision: str, options: argparse.Namespace) -> None:
     say(f"   timed: {elapsed()}")
     if name in options.energy:
         for label, run in runs.items():
-            if label in ("LangevinMiddle", "custom") or time.perf_counter() - BEGIN > options.budget:
+            if label in ("LangevinMiddle", "Langevin", "custom") or time.perf_counter() - BEGIN > options.budget:
                 continue
             try:
                 numbers = measure_energy(run, options.duration, 50)

@@ -19,8 +19,8 @@ namespace {
 
 const double BOLTZMANN = 0.00831446261815324; // kJ/mol/K
 
-// The monitor's length l (nm); k is the smallest number with 2^k >= (U/U_ref)^POWER/TRIGGER.
-const double FLIGHT_LENGTH = 0.0125, POWER = 2.0 / 3.0, TRIGGER = 2.2;
+// k is the smallest number with 2^k >= (U/U_ref)^POWER/TRIGGER.
+const double POWER = 2.0 / 3.0, TRIGGER = 2.2;
 // U_ref is no less than this change of momentum a step, in units of the thermal one, or this part of the size of the system (see
 // findFloor()), and begins with no more than the multiple of that. It changes by the rate in each step.
 const double FLOOR = 0.5, FLOOR_PART = 0.2, LARGEST_START = 4, FOLLOWING_RATE = 0.002;
@@ -98,15 +98,28 @@ void LangevinDynamics::startReference() {
         reference = std::max(findFloor(COLDEST), std::min(values[0], LARGEST_START * findFloor(COLDEST)));
 }
 
+double LangevinDynamics::getFollowingFactor() const {
+    return settings.langevin.reference > 0 || settings.langevin.isReferenceFrozen ? 1.0 : std::exp(FOLLOWING_RATE);
+}
+
 // A running median. The heat of a clash must not teach it what is calm: where it leaves by less than the rate in a step, through a low
 // friction or small steps, U_ref would meet U at a temperature that steps without substeps keep up by their own errors.
 void LangevinDynamics::followReference() {
-    if (settings.langevin.reference > 0 || settings.langevin.isReferenceFrozen)
+    const double factor = getFollowingFactor();
+    if (factor == 1)
         return;
     if (doublings > 0 && values[0] > std::max(reference, LARGEST_THERMAL * findFloor(ROOM_TEMPERATURE)))
         return;
-    const double rate = values[0] > reference ? FOLLOWING_RATE : values[0] < reference ? -FOLLOWING_RATE : 0.0;
-    reference = std::max(findFloor(COLDEST), reference * std::exp(rate));
+    reference *= values[0] > reference ? factor : values[0] < reference ? 1 / factor : 1.0;
+    reference = std::max(findFloor(), reference);
+}
+
+double LangevinDynamics::findFloor() const {
+    return findFloor(COLDEST);
+}
+
+double LangevinDynamics::findLargestCalm() const {
+    return settings.langevin.maxDoublings > 0 ? std::pow(TRIGGER, 1 / POWER) : std::numeric_limits<double>::max();
 }
 
 // k, without its bound.
@@ -218,6 +231,17 @@ std::function<void()> LangevinDynamics::remember() {
     };
 }
 
+void LangevinDynamics::adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
+                             double newReference, bool isFollowed, int64_t drawn) {
+    takeState(positions, velocities, forces, energy);
+    v = velocities; // which have been projected, and so changed in the last bits
+    reference = newReference;
+    numDrawn = drawn;
+    doublings = 0;
+    if (!isFollowed)
+        followReference();
+}
+
 LangevinDynamics::Memory LangevinDynamics::getMemory() const {
     return {theta.values, theta.rates, lambda, values[0], lastSubstep};
 }
@@ -286,14 +310,18 @@ double LangevinDynamics::computeHalfStepKineticEnergy() {
 
 // ---------------------------------------------------------------------------------------------------------- a step
 
-// v <- a v + sqrt(kT (1 - a^2)) M^-1/2 xi. The numbers xi are those of the step, whatever attempt asks for them.
-void LangevinDynamics::addNoise(Vectors& velocities) {
+LangevinDynamics::Noise LangevinDynamics::findNoise() const {
     const double damping = settings.langevin.friction * settings.stepSize;
     const double kT = BOLTZMANN * settings.langevin.temperature;
-    const double a = std::exp(-damping), s = std::sqrt(-kT * std::expm1(-2 * damping));
+    return {std::exp(-damping), std::sqrt(-kT * std::expm1(-2 * damping))};
+}
+
+// v <- a v + sqrt(kT (1 - a^2)) M^-1/2 xi. The numbers xi are those of the step, whatever attempt asks for them.
+void LangevinDynamics::addNoise(Vectors& velocities) {
+    const double a = findNoise().damping, s = findNoise().size;
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
     const vector<int>& particles = solver.getMovingParticles();
-    if (damping == 0)
+    if (a == 1)
         return;
     solver.share((int) particles.size(), [&](int first, int end) {
         for (int p = first; p < end; p++) {

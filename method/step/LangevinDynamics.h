@@ -65,6 +65,9 @@ public:
         solver.share(count, task);
     }
     void setSettings(const Settings& newSettings);
+    const Settings& getSettings() const {
+        return settings;
+    }
 
     bool projectPositions(std::vector<OpenMM::Vec3>& positions);
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
@@ -107,6 +110,35 @@ public:
         return {(double) seed, (double) numDrawn};
     }
     void setRandomState(const std::vector<double>& state);
+
+    // For somebody else who takes the steps that need no substeps.
+
+    /** Of the monitor (nm). */
+    static constexpr double FLIGHT_LENGTH = 0.0125;
+    /** The factor by which U_ref follows U in a step; 1 if it does not. */
+    double getFollowingFactor() const;
+    /** U_ref is no less than this. */
+    double findFloor() const;
+    /** The largest U/U_ref at both ends of a step that needs no substeps; without bound if it may have none. */
+    double findLargestCalm() const;
+    /** a and sqrt(kT (1 - a^2)) of the noise. */
+    struct Noise {
+        double damping, size;
+    };
+    Noise findNoise() const;
+    /** Whether the next step is known to begin as one without substeps. */
+    bool isCalm() const {
+        return reference > 0 && !q.empty() && values[0] <= findLargestCalm() * reference;
+    }
+    /**
+     * Go on from the state that such steps of the size H have led to.
+     *
+     * @param isFollowed    U_ref has followed U there; else it does so now
+     * @param drawn         steps that have drawn noise
+     */
+    void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double newReference, bool isFollowed,
+               int64_t drawn);
     /** How many steps have been made of substeps, and of how many at most. */
     long long getNumSubstepped() const {
         return numSubstepped;

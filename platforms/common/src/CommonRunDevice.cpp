@@ -6,6 +6,7 @@
 #include "ExpressionInfo.h"
 #include "constraints/StepFailure.h"
 #include "openmm/common/ContextSelector.h"
+#include "run/HostLangevinDevice.h"
 #include "run/HostVRattleDevice.h"
 #include "run/IntegratorSettings.h"
 #include <algorithm>
@@ -22,8 +23,7 @@ namespace {
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 // OpenMM sorts the particles anew after so many steps, once somebody asks for it.
 const int STEPS_BETWEEN_REORDERINGS = 250;
-// The steps that are taken without a look at the device, while none fails.
-const int MAX_STEPS_UNTIL_LOOK = 1 << 20;
+const int MANY_STEPS = 1 << 20;
 
 // Takes note that forces and particles are no longer in the same order. Nothing else of ours depends on it: only identical molecules
 // change places, and they have identical clusters.
@@ -46,9 +46,9 @@ CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::Com
                                        const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
         compute(compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false), hasBegun(false),
-        isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MAX_STEPS_UNTIL_LOOK),
+        isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MANY_STEPS),
         lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
-        writeCount(0), areAtomsReordered(true), numDeviceRescues(0) {
+        writeCount(0), areAtomsReordered(true), reorderedStep(0), numDeviceRescues(0) {
     // Too late where the Context's other integrators have initialized it already: then molecules that differ in expressions alone may
     // change places on the device, and the host takes the steps.
     const bool areKnown = settings.expressions.empty() || !compute.getEnergyBuffer().isInitialized();
@@ -196,11 +196,7 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
     try {
         context.computeVirtualSites();
         vectors->setStepCount(settledCount + numAsked);
-        // A state that is to be put back must not have been put into another order.
-        if (compute.getStepsSinceReorder() < STEPS_BETWEEN_REORDERINGS || !steps->hasFailed()) {
-            ContextSelector selector(compute);
-            compute.reorderAtoms();
-        }
+        reorderAtoms();
         computeForces();
     }
     catch (...) {
@@ -209,13 +205,45 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
         throw;
     }
     steps->finish(groupEnergy);
-    if (numAsked >= stepsUntilLook)
+    if (numAsked >= std::min(stepsUntilLook, getMostStepsUntilLook()))
         settle();
+}
+
+// After the positions of a step. The state before it is kept in the order that there was.
+template <class Host> void CommonRunDevice<Host>::reorderAtoms() {
+    ContextSelector selector(compute);
+    const bool isDue = numAsked == 1 || compute.getStepsSinceReorder() >= STEPS_BETWEEN_REORDERINGS;
+    if (isDue && steps->hasFailed())
+        return; // an earlier state is to be put back
+    if (isDue)
+        lastOffsets = compute.getPosCellOffsets();
+    compute.reorderAtoms();
+    if (areAtomsReordered) {
+        reorderedStep = numAsked;
+        lastOrder = order;
+    }
+}
+
+// Of the state that has been put back.
+template <class Host> void CommonRunDevice<Host>::restoreOrder() {
+    const Vectors positions = vectors->getPositions(); // of what does not move, in the new order
+    compute.setAtomIndex(lastOrder);
+    compute.setPosCellOffsets(lastOffsets);
+    if (!hasMassless)
+        return;
+    Vectors all = vectors->getPositions();
+    for (size_t i = 0; i < masses.size(); i++)
+        if (masses[i] == 0)
+            all[i] = positions[i];
+    vectors->setPositions(all);
 }
 
 // Take note of what has become of the steps that were asked for.
 template <class Host> void CommonRunDevice<Host>::accept(const DeviceSteps::Report& report) {
     const bool areAllComplete = report.numSteps == numAsked;
+    if (report.numSteps + 1 == reorderedStep)
+        restoreOrder();
+    reorderedStep = 0;
     state = report.state;
     if (report.numSteps > 0)
         lastStep = {report.stepSize, report.state.density};
@@ -237,7 +265,7 @@ template <class Host> void CommonRunDevice<Host>::settle() {
         const DeviceSteps::Report report = steps->read();
         accept(report);
         // What follows a step that has failed is done in vain, so where steps fail often the device is looked at often.
-        stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MAX_STEPS_UNTIL_LOOK);
+        stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MANY_STEPS);
         if (!report.hasFailed)
             return;
         // The step that failed is left to the host, which has other means, and says what is wrong if they fail too.
@@ -467,3 +495,4 @@ bool CommonRunDevice<Host>::resume(const RunState& run, const IntegratorSettings
 }
 
 template class OpenMMVRattle::CommonRunDevice<HostVRattleDevice>;
+template class OpenMMVRattle::CommonRunDevice<HostLangevinDevice>;

@@ -9,6 +9,7 @@
 #include "openmm/internal/ContextImpl.h"
 #include "run/RunDevice.h"
 #include "run/RunState.h"
+#include <limits>
 #include <memory>
 
 namespace OpenMMVRattle {
@@ -58,6 +59,7 @@ protected:
     using Host::boxVectors;
     using Host::expressions;
     using Host::forceGroups;
+    using Host::hasMassless;
     using Host::lastStep;
     using Host::masses;
     using Host::method;
@@ -83,6 +85,10 @@ protected:
     }
     /** Whether it matters that all velocities have changed by the same. */
     virtual bool doesFrameMatter() = 0;
+    /** How many steps may be done in vain because one before them has failed. */
+    virtual int getMostStepsUntilLook() const {
+        return std::numeric_limits<int>::max();
+    }
     /** The monitors on the GPU, if it is there that the state is. */
     bool readMonitorValues(std::vector<double>& values);
     /** What the GPU has beside the monitors, if it is there that the state is; else null. */
@@ -102,6 +108,8 @@ private:
     void beginOnDevice();
     void stepOnDevice(double maxTime);
     void accept(const DeviceSteps::Report& report);
+    void reorderAtoms();
+    void restoreOrder();
     OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
     ExpressionInfo* expressionInfo;     // of the Context, or null
@@ -123,6 +131,9 @@ private:
     int writeCount;     // of positions, when they were computed
     std::vector<int> order;  // of the atoms, likewise
     bool areAtomsReordered; // perhaps, since then
+    int reorderedStep; // of those asked for, the last after which the atoms were put into another order; 0 for none
+    std::vector<int> lastOrder; // the one before
+    std::vector<OpenMM::mm_int4> lastOffsets;
     long long numDeviceRescues;
 };
 

@@ -4,8 +4,8 @@
 #ifndef OPENMMVRATTLE_COMMONVRATTLEKERNELFACTORY_H_
 #define OPENMMVRATTLE_COMMONVRATTLEKERNELFACTORY_H_
 
+#include "CommonLangevinDevice.h"
 #include "CommonVRattleDevice.h"
-#include "ComputeVectors.h"
 #include "openmm/KernelFactory.h"
 #include "openmm/OpenMMException.h"
 #include "openmmvrattle/VRattleKernels.h"
@@ -24,11 +24,8 @@ public:
     }
     RunDevice& initialize(OpenMM::ContextImpl& context, const OpenMM::Integrator& integrator,
                           const IntegratorSettings& settings) override {
-        if (settings.langevin) { // whose steps are taken on the host, with forces from the GPU
-            compute.initializeContexts();
-            device =
-                makeHostRunDevice(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings);
-        }
+        if (settings.langevin)
+            device = std::make_unique<CommonLangevinDevice>(context, compute, integrator, settings);
         else
             device = std::make_unique<CommonVRattleDevice>(context, compute, integrator, settings);
         return *device;

@@ -25,8 +25,9 @@ const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
 const double SINGLE_DENSITY_ROUNDING = 1e-4, DENSITY_ROUNDING = 1e-8;
 const double MARGIN = 0.1;
 // In each launch the stages of large clusters have stamps of their own.
-const int STAMPS = 32;
-static_assert(StepProgram::MAX_STAGES < STAMPS, "stages of two launches would have the same stamp");
+const int STAMPS = 64;
+static_assert(StepProgram::getMaxStages(StepProgram::Langevin, false) < STAMPS,
+              "stages of two launches would have the same stamp");
 // A factor in single precision leaves about 1e-7 of what a projection changes in velocities, 1e-10 nm in a step: where more than that
 // is asked for they are projected twice.
 const double SINGLE_PROJECTION = 2e-9;
@@ -83,8 +84,8 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& cl
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
         isWide(context.getSupportsDoublePrecision()),
         groupSize(StepProgram::getGroupSize(!large.isEmpty() || expressions)), numGroups(0), numPartials(0),
-        numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), numTrials(MOST_TRIALS),
-        groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0), areVelocitiesKept(false) {
+        numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), numTrials(MOST_TRIALS), seed(0),
+        numDrawn(0), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0), areVelocitiesKept(false) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
@@ -132,6 +133,7 @@ void DeviceSteps::initialize() {
     failure.upload(vector<int>{0, 0});
     iterationCounts.initialize<int>(context, numGroups * groupSize, "vrattleIterations");
     context.clearBuffer(iterationCounts);
+    noise.initialize<int>(context, 5, "vrattleNoise");
     if (!large.isEmpty())
         initializeLarge();
     if (expressions)
@@ -174,7 +176,10 @@ void DeviceSteps::initializeLarge() {
 void DeviceSteps::setSettings(const Settings& newSettings) {
     OpenMM::ContextSelector selector(context);
     settings = newSettings;
+    if (isLangevin())
+        settings.terms = {{StepMonitor::ConstraintAndAppliedForce, 1, 1, 1}}; // stands for its own monitor
     compile(settings.isAutomatic ? StepProgram::Automatic
+            : isLangevin()       ? StepProgram::Langevin
                                  : StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
     vector<double> numbers(program->getNumSettings());
     numbers[Control::Nominal] = settings.stepSize;
@@ -185,6 +190,13 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
     numbers[Control::DensityTolerance] =
         std::max(MARGIN * settings.tolerance, isMixed ? DENSITY_TOLERANCE : SINGLE_DENSITY_TOLERANCE);
     numbers[Control::DensityRounding] = isMixed ? DENSITY_ROUNDING : SINGLE_DENSITY_ROUNDING;
+    if (isLangevin()) {
+        numbers[Control::Damping] = settings.langevin->damping;
+        numbers[Control::NoiseSize] = settings.langevin->noise;
+        numbers[Control::ReferenceFloor] = settings.langevin->floor;
+        numbers[Control::Following] = settings.langevin->growth;
+        numbers[Control::LargestCalm] = settings.langevin->largestCalm;
+    }
     for (size_t k = 0; k < settings.terms.size(); k++) {
         numbers[Control::FirstTerm + 3 * k] = settings.terms[k].weight;
         numbers[Control::FirstTerm + 3 * k + 1] = settings.terms[k].power;
@@ -307,6 +319,10 @@ void DeviceSteps::setArguments(Kernels& created) {
     created.advance->addArg(oldVelocities);
     created.advance->addArg(iterationCounts);
     addState(created.advance);
+    if (isLangevin()) {
+        created.advance->addArg(noise);
+        created.advance->addArg(context.getAtomIndexArray());
+    }
 
     created.restore->addArg(context.getNumAtoms());
     created.restore->addArg(context.getPosq());
@@ -366,6 +382,11 @@ void DeviceSteps::setLargeArguments(Kernels& created) {
     created.advanceLarge->addArg(oldPositions);
     created.advanceLarge->addArg(oldVelocities);
     addState(created.advanceLarge);
+    if (isLangevin()) {
+        created.advanceLarge->addArg(settingsArray);
+        created.advanceLarge->addArg(noise);
+        created.advanceLarge->addArg(context.getAtomIndexArray());
+    }
 }
 
 // The type must be that of the kernel's parameter.
@@ -395,6 +416,11 @@ void DeviceSteps::launch(ComputeKernel& kernel, int numOwnArguments) {
 int DeviceSteps::nextStamp() {
     numLargeLaunches++;
     return (int) (numLargeLaunches * STAMPS & 0x7fffffffu);
+}
+
+int DeviceSteps::getMaxStages() const {
+    return StepProgram::getMaxStages(isLangevin() ? StepProgram::Langevin : StepProgram::Fixed,
+                                     large.getForm().isStaged);
 }
 
 int DeviceSteps::getNumProjections() const {
@@ -471,7 +497,13 @@ bool DeviceSteps::begin(const State& state, double energy) {
         std::copy(std::begin(state.references), std::end(state.references), &block[Control::FirstReference]);
         block[Control::IsAccepted] = 1;
     }
+    block[Control::Reference] = state.reference;
+    block[Control::IsFollowed] = state.isFollowed;
     control[half].upload(block, true);
+    seed = state.seed;
+    numDrawn = state.numDrawn;
+    // The words of the numbers, the lower ones first, and the step that is the next to draw.
+    noise.upload(vector<int>{(int) seed, (int) (seed >> 32), (int) numDrawn, (int) (numDrawn >> 32), stepNumber + 1});
     numStepsRead = numRescuesRead = 0;
     elapsedRead = 0;
     groupEnergy = energy;
@@ -536,7 +568,7 @@ void DeviceSteps::advance(double maxStep) {
                 setMixed(kernels.tryLarge, 5, settings.tolerance);
                 kernels.tryLarge->setArg(7, trials[(i + 1) % 2]);
                 kernels.tryLarge->setArg(8, trialPartials[(i + 1) % 2]);
-                launchLarge(kernels.tryLarge, stepNumber, StepProgram::MAX_STAGES);
+                launchLarge(kernels.tryLarge, stepNumber, getMaxStages());
             }
         }
     kernels.advance->setArg(0, stepNumber);
@@ -557,7 +589,7 @@ void DeviceSteps::advance(double maxStep) {
     if (kernels.advanceLarge) {
         setMixed(kernels.advanceLarge, 5, settings.tolerance);
         kernels.advanceLarge->setArg(6, control[half]);
-        launchLarge(kernels.advanceLarge, stepNumber, StepProgram::MAX_STAGES);
+        launchLarge(kernels.advanceLarge, stepNumber, getMaxStages());
     }
 }
 
@@ -642,6 +674,11 @@ DeviceSteps::Report DeviceSteps::fill(const vector<double>& block) {
     report.elapsed = block[Control::Elapsed] - elapsedRead;
     report.numSteps = (int) std::lround(block[Control::Steps] - numStepsRead);
     report.numRescues = (int) std::lround(block[Control::Rescues] - numRescuesRead);
+    numDrawn += report.numSteps;
+    report.state.reference = block[Control::Reference];
+    report.state.isFollowed = block[Control::IsFollowed] != 0;
+    report.state.seed = seed;
+    report.state.numDrawn = numDrawn;
     elapsedRead = block[Control::Elapsed];
     numStepsRead = block[Control::Steps];
     numRescuesRead = block[Control::Rescues];

@@ -10,32 +10,42 @@
 #include "StepProgram.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
+#include <cstdint>
 #include <map>
 #include <memory>
+#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * The regular steps of VRATTLE on a device: what is launched, and what the host reads. The state between two steps is on the
- * device alone: positions and velocities in OpenMM's arrays, the density and what goes with it in a control block. Forces are
- * somebody else's to compute between advance() and finish().
+ * The regular steps of VRATTLE, or those of Langevin dynamics that need no substeps, on a device: what is launched, and what the host
+ * reads. The state between two steps is on the device alone: positions and velocities in OpenMM's arrays, the density and what goes with
+ * it in a control block. Forces are somebody else's to compute between advance() and finish().
+ *
+ * A step of Langevin dynamics whose end asks for substeps has failed, which the next one notices.
  *
  * Nothing here waits for the device but read(), putBack() and what changes settings.
  */
 class DeviceSteps {
 public:
+    struct Langevin {
+        double damping, noise; // a and sqrt(kT (1 - a^2))
+        double floor, growth;  // U_ref is no less, and follows U by this factor
+        double largestCalm;    // steps that end with a larger U/U_ref need substeps
+    };
     struct Settings {
         double stepSize;
         StepDensity density;
         StepDensity::Update update;
         bool isFixedStep;
         double tolerance;
-        std::vector<StepMonitor::Term> terms; // with the references in force
+        std::vector<StepMonitor::Term> terms; // with the references in force; of no use to Langevin dynamics
         /** With automatic step control, in place of density, update and monitors: its choices, and the degrees of freedom. */
         bool isAutomatic = false;
         AutomaticRecursions::AutomaticChoice choice = {};
         double numDegreesOfFreedom = 1;
+        std::optional<Langevin> langevin = {};
     };
     /** What of the state is in the control block. */
     struct State {
@@ -46,6 +56,10 @@ public:
         /** With automatic step control: its numbers and references. */
         AutomaticRecursions::AutomaticNumbers automatic = {};
         double references[AutomaticControl::NUM_MONITORS] = {};
+        // Of Langevin dynamics:
+        double reference = 0; // U_ref
+        bool isFollowed = true; // it has followed U(q[n],p[n])
+        int64_t seed = 0, numDrawn = 0;
     };
     struct Report {
         State state;
@@ -124,6 +138,9 @@ private:
     };
     void initialize();
     void compile(StepProgram::Update update);
+    bool isLangevin() const {
+        return settings.langevin.has_value();
+    }
     void initializeLarge();
     void setArguments(Kernels& created);
     void setLargeArguments(Kernels& created);
@@ -133,6 +150,7 @@ private:
     void addLastState(OpenMM::ComputeKernel& kernel);
     void launch(OpenMM::ComputeKernel& kernel, int numOwnArguments);
     int nextStamp();
+    int getMaxStages() const;
     int getNumProjections() const;
     void launchLarge(OpenMM::ComputeKernel& kernel, int step, int numStages);
     void launchFinish(int step, double kick, Control::Change change, bool isStored);
@@ -156,11 +174,12 @@ private:
     int half; // the control block that is in force
     int stepNumber; // of the last advance()
     int numTrials; // launches for a density
+    int64_t seed, numDrawn; // by the steps that the host knows of
     double groupEnergy;
     double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
     OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2],
         reportArray;
-    OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts;
+    OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts, noise;
     OpenMM::ComputeArray lastForces, lastSquares, lastVelocities; // of automatic step control
     bool areVelocitiesKept;
     OpenMM::ComputeArray largeTables, largePieces, largeRows, largeRowLengths, largeAtoms, largeJoints,

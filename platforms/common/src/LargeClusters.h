@@ -37,7 +37,7 @@ public:
         bool isStaged; // each stage is a launch of its own, since groups cannot wait for each other
         bool isFused; // the pieces are work groups of the launches of the small clusters
     };
-    /** Sixteen numbers for each piece, as kernels/large.cc has them. */
+    /** Sixteen numbers for each piece, as kernels/large.cc has them. The first piece of a cluster knows how many there are. */
     struct Piece {
         int firstTable, tableSize, firstRow, numInner;
         int numBorders, firstAtom, numAtoms, firstJoint;

@@ -5,6 +5,7 @@
 #include "ClusterAlgebra.h"
 #include "DeviceSources.h"
 #include "constraints/ConstraintMatrix.h"
+#include "step/LangevinDynamics.h"
 #include <algorithm>
 #include <cmath>
 #include <sstream>
@@ -60,6 +61,7 @@ enum Quantity {
     SpeedSquares,   // sum |v|^2
     LargestForce,   // max |F|^2
     LargestArc,     // max |F|^2 + |v|^2
+    ClusterPowers,  // A_c of Langevin dynamics
     Failures,       // of trials
     // Of automatic step control, which adds them up itself (kernels/automatic.cc)
     HardnessOnStep, // sum A_c^4
@@ -68,33 +70,39 @@ enum Quantity {
     AutomaticChange,
     AutomaticScale
 };
-enum Merge { Add, Largest, Power };
+// A p-norm takes two places; one of sums over the particles of a cluster a third, for the pieces of large clusters.
+enum Merge { Add, Largest, Power, ClusterPower };
+const double ORDER_OF_CLUSTERS = 4;
 struct QuantityText {
     Merge merge;
     bool ofConstraint;
     const char* term; // added to it
 };
-const map<Quantity, QuantityText> QUANTITIES = {{MultiplierSquares, {Add, true, "lambda*lambda/4"}},
-                                                {ConstraintWork, {Add, true, "lambda*rightSide"}},
-                                                {AppliedSquares, {Add, false, "w*forceSquared"}},
-                                                {MultiplierPowers, {Power, true, "fabs(lambda)/2"}},
-                                                {ForcePowers, {Power, false, "sqrt(forceSquared)"}},
-                                                {ForceSquares, {Add, false, "forceSquared"}},
-                                                {KineticSquares, {Add, false, "dot3(v, v)/w"}},
-                                                {SpeedSquares, {Add, false, "dot3(v, v)"}},
-                                                {LargestForce, {Largest, false, "forceSquared"}},
-                                                {LargestArc, {Largest, false, "forceSquared + dot3(v, v)"}},
-                                                {Failures, {Add, false, nullptr}},
-                                                {HardnessOnStep, {Power, false, nullptr}},
-                                                {HardnessOnHalfStep, {Power, false, nullptr}},
-                                                {AutomaticKinetic, {Add, false, nullptr}},
-                                                {AutomaticChange, {Add, false, nullptr}},
-                                                {AutomaticScale, {Add, false, nullptr}}};
+const map<Quantity, QuantityText> QUANTITIES = {
+    {MultiplierSquares, {Add, true, "lambda*lambda/4"}},
+    {ConstraintWork, {Add, true, "lambda*rightSide"}},
+    {AppliedSquares, {Add, false, "w*forceSquared"}},
+    {MultiplierPowers, {Power, true, "fabs(lambda)/2"}},
+    {ForcePowers, {Power, false, "sqrt(forceSquared)"}},
+    {ForceSquares, {Add, false, "forceSquared"}},
+    {KineticSquares, {Add, false, "dot3(v, v)/w"}},
+    {SpeedSquares, {Add, false, "dot3(v, v)"}},
+    {LargestForce, {Largest, false, "forceSquared"}},
+    {LargestArc, {Largest, false, "forceSquared + dot3(v, v)"}},
+    {ClusterPowers, {ClusterPower, false, "(netSquared + sqrt(netSquared)*dot3(v, v)/FLIGHT_LENGTH)/w"}},
+    {Failures, {Add, false, nullptr}},
+    {HardnessOnStep, {Power, false, nullptr}},
+    {HardnessOnHalfStep, {Power, false, nullptr}},
+    {AutomaticKinetic, {Add, false, nullptr}},
+    {AutomaticChange, {Add, false, nullptr}},
+    {AutomaticScale, {Add, false, nullptr}}};
 
 struct MonitorText {
     vector<Quantity> quantities;
     string value; // in which $0 and $1 stand for the sums
 };
+// U = (sum_c A_c^4)^(1/8)
+const MonitorText NET_FORCES = {{ClusterPowers}, "($0c == 0 ? sqrt($0)*sqrt(sqrt(sqrt($0b))) : (wide) -1)"};
 const map<StepMonitor::Kind, MonitorText> MONITORS = {
     {StepMonitor::ConstraintMultipliers, {{MultiplierSquares}, "sqrt($0)"}}, // (4.4)
     {StepMonitor::ConstraintForce, {{ConstraintWork}, "sqrt(max($0, (wide) 0))"}},
@@ -152,6 +160,10 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
     if (expressions != nullptr)
         writeExpressions(*expressions);
     writeAutomaticControl((int) large.getPieces().size());
+    words["LANGEVIN_FUNCTIONS"] = update == Langevin
+                                      ? DeviceSources::langevin
+                                      : "#define NOISE_PARAMETERS\n#define NOISE_ARGUMENTS\n#define NO_NOISE\n"
+                                        "#define NOISE_STATE\n#define LARGE_NOISE_STATE\n";
     source = DeviceSources::step;
     for (const auto& word : words)
         replaceAll(source, word.first, word.second);
@@ -161,6 +173,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"BOUNDED", Bounded},
                                       {"SEMI_EXPLICIT", SemiExplicit},
                                       {"AUTOMATIC", Automatic},
+                                      {"LANGEVIN", Langevin},
                                       {"UPDATE", update},
                                       {"HALF_SUMS", update == SemiExplicit ? 1 : 0},
                                       {"NUM_MONITORS", (int) terms.size()},
@@ -179,6 +192,8 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"MISMATCH_SLOPE", Control::MismatchSlope},
                                       {"IS_SHORTENED", Control::IsShortened},
                                       {"MOST_TRIALS", Control::MostTrials},
+                                      {"REFERENCE", Control::Reference},
+                                      {"IS_FOLLOWED", Control::IsFollowed},
                                       {"FIRST_VALUE", Control::FirstValue},
                                       {"CONTROL_SIZE", getControlSize()},
                                       {"NOMINAL", Control::Nominal},
@@ -188,6 +203,11 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"CURVE", Control::Curve},
                                       {"DENSITY_TOLERANCE", Control::DensityTolerance},
                                       {"DENSITY_ROUNDING", Control::DensityRounding},
+                                      {"DAMPING", Control::Damping},
+                                      {"NOISE_SIZE", Control::NoiseSize},
+                                      {"REFERENCE_FLOOR", Control::ReferenceFloor},
+                                      {"FOLLOWING", Control::Following},
+                                      {"LARGEST_CALM", Control::LargestCalm},
                                       {"FIRST_TERM", Control::FirstTerm},
                                       {"NOT_CONVERGED", Control::NotConverged},
                                       {"INVALID_MONITOR", Control::InvalidMonitor},
@@ -220,6 +240,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
     defines["SLOW_CONVERGENCE"] = "0.25f";
     defines["BOUND_MARGIN"] = literal(StepDensity::DOMAIN_MARGIN);
     defines["SLIVER"] = "1e-6f";
+    defines["FLIGHT_LENGTH"] = "(mixed) " + literal(LangevinDynamics::FLIGHT_LENGTH) + (isMixed ? "" : "f");
 }
 
 // The sums that the monitors need, each once. A p-norm's sum takes two places.
@@ -228,22 +249,25 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
     map<Key, int> places;
     numSums = 0;
     auto keyOf = [](Quantity quantity, double order) {
-        return Key(quantity, QUANTITIES.at(quantity).merge == Power ? order : 0.0);
+        const Merge merge = QUANTITIES.at(quantity).merge;
+        return Key(quantity, merge == Power ? order : merge == ClusterPower ? ORDER_OF_CLUSTERS : 0.0);
     };
     auto add = [&](const Key& key) {
         if (places.count(key) == 0) {
             places[key] = numSums;
-            numSums += QUANTITIES.at(key.first).merge == Power ? 2 : 1;
+            const Merge merge = QUANTITIES.at(key.first).merge;
+            numSums += merge == ClusterPower ? 3 : merge == Power ? 2 : 1;
         }
         return places[key];
     };
     string values;
     for (size_t k = 0; k < terms.size(); k++) {
-        const MonitorText& monitor = MONITORS.at(terms[k].kind);
+        const MonitorText& monitor = update == Langevin ? NET_FORCES : MONITORS.at(terms[k].kind);
         string value = monitor.value;
         for (size_t i = 0; i < monitor.quantities.size(); i++) {
             const int place = add(keyOf(monitor.quantities[i], terms[k].order));
             replaceAll(value, "$" + to_string(i) + "b", "(wide) sums[" + to_string(place + 1) + "]");
+            replaceAll(value, "$" + to_string(i) + "c", "(wide) sums[" + to_string(place + 2) + "]");
             replaceAll(value, "$" + to_string(i), "(wide) sums[" + to_string(place) + "]");
         }
         replaceAll(value, "$p", literal(1 / terms[k].order));
@@ -258,7 +282,7 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
     }
     if (hasHalfSums() || numSums == 0) // an array has at least one element
         defines["FAILURES"] = to_string(add(Key(Failures, 0)));
-    string constraintTerms, particleTerms, mergeTerms, powers;
+    string constraintTerms, particleTerms, clusterTerms, shareTerm, mergeTerms, powers;
     map<double, int> orders; // each with a number for its functions
     for (const auto& entry : places) {
         const QuantityText& quantity = QUANTITIES.at(entry.first.first);
@@ -275,16 +299,29 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
             text += sum + " = max(" + sum + ", " + quantity.term + ");\n    ";
             mergeTerms += sum + " = max(" + sum + ", " + other + ");\n    ";
             break;
-        case Power: {
+        case Power:
+        case ClusterPower: {
+            const bool ofCluster = quantity.merge == ClusterPower;
             const string name =
                 "Power_" + to_string(orders.insert({entry.first.second, (int) orders.size()}).first->second);
             if (quantity.term != nullptr)
-                text += "add" + name + "(sums + " + address + ", " + quantity.term + ");\n    ";
+                (ofCluster ? clusterTerms : text) +=
+                    "add" + name + "(sums + " + address + ", " + (ofCluster ? "share" : quantity.term) + ");\n    ";
             mergeTerms += "merge" + name + "(sums + " + address + ", other + " + address + ");\n    ";
+            if (!ofCluster)
+                break;
+            const string piece = to_string(entry.second + 2);
+            mergeTerms += "sums[" + piece + "] += other[" + piece + "];\n    ";
+            shareTerm = quantity.term;
+            defines["PIECE_COUNT"] = address;
+            defines["PIECE_SHARE"] = piece;
             break;
         }
         }
     }
+    defines["CLUSTER_SUMS"] = shareTerm.empty() ? "0" : "1";
+    words["CLUSTER_TERMS"] = clusterTerms;
+    words["SHARE_TERM"] = shareTerm;
     words["CONSTRAINT_TERMS"] = constraintTerms;
     words["PARTICLE_TERMS"] = particleTerms;
     words["MERGE_TERMS"] = mergeTerms;
@@ -345,7 +382,8 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
             tail;
         trialCases += head + "isSolved = try" + name + "(c, CLUSTER_ARGUMENTS, dt, tolerance, sums)" + tail;
         advanceCases += head + "iterations = advance" + name +
-                        "(c, CLUSTER_ARGUMENTS, dt, tolerance, oldPositions, oldVelocities)" + tail;
+                        "(c, CLUSTER_ARGUMENTS, kick, drift, tolerance, oldPositions, oldVelocities NOISE_ARGUMENTS)" +
+                        tail;
         numSlots = next;
         numAtoms += count * kind.numAtoms;
         numLengths += count * numConstraints;
@@ -361,8 +399,9 @@ void StepProgram::writeLargeClusters(const LargeClusters& large) {
     words["LARGE_CLUSTERS"] =
         large.isEmpty() ? "#define FUSED_PARAMETERS\n#define FUSED_MEMORY\n" : DeviceSources::large;
     defines["IS_FUSED"] = form.isFused ? "1" : "0";
+    defines["NUM_PIECES"] = to_string(large.getPieces().size());
     defines["NUM_FUSED"] = to_string(form.isFused ? large.getPieces().size() : 0);
-    defines["MAX_STAGES"] = to_string(MAX_STAGES);
+    defines["MAX_STAGES"] = to_string(getMaxStages(update, form.isStaged));
     if (large.isEmpty())
         return;
     const bool hasNarrow = large.getNarrow() > 0;

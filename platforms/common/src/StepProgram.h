@@ -33,6 +33,8 @@ enum Field {
     MismatchSlope, // of (3.14) as a function of the density, in the last step
     IsShortened,   // the last step was cut short
     MostTrials,    // of a density, since the host has looked last
+    Reference,     // of Langevin dynamics: U_ref
+    IsFollowed,    // likewise: it has followed U
     FirstValue     // U_k
 };
 /** With automatic step control other numbers follow, and a word whether they are those at the end of the last step. */
@@ -51,6 +53,11 @@ enum Setting {
     Curve,
     DensityTolerance, // of (3.14), relative
     DensityRounding,  // the same where rounding allows no better
+    Damping, // of Langevin dynamics: a, sqrt(kT (1 - a^2)), the bound and the factor of U_ref, the largest U/U_ref of a calm step
+    NoiseSize,
+    ReferenceFloor,
+    Following,
+    LargestCalm,
     FirstTerm
 };
 /** What makes a step fail; the slot of the cluster is above. Irregular are constraints that depend on each other, and forces. */
@@ -68,21 +75,26 @@ const int TrialSize = 9;
  */
 class StepProgram {
 public:
-    enum Update { Fixed, Sum, Bounded, SemiExplicit, Automatic };
+    enum Update { Fixed, Sum, Bounded, SemiExplicit, Automatic, Langevin };
     /** Where the data of a kind lie. */
     struct Place {
         int firstSlot, firstAtom, firstLength;
     };
     static const int SLOT_UNIT = 32;
-    /** Of a large cluster: an iteration that takes longer is left to the host. */
-    static const int MAX_STAGES = 16;
+    /**
+     * Of a large cluster: an iteration that takes longer is left to the host. There are two in a step of Langevin dynamics. Stages that
+     * nobody needs cost nothing, unless each is a launch.
+     */
+    static constexpr int getMaxStages(Update update, bool isStaged) {
+        return update != Langevin ? 16 : isStaged ? 28 : 60;
+    }
 
     /**
      * @param kinds         the clusters that one thread can have
      * @param large         those of more distances
      * @param expressions   those with constraints given as expressions, or null
      * @param numThreads    of a group that works on one of the last two
-     * @param terms         the monitors; none with automatic step control
+     * @param terms         the monitors; none with automatic step control, and Langevin dynamics has its own, the only one
      * @param update        how the density is found
      * @param isMixed       whether positions and velocities are in double precision
      * @param isWide        whether the device has doubles

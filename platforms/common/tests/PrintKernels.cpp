@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
-// with the numbers of a monitor and an update (3 for automatic step control, which needs no monitor), and graphs "common" (hydrogens
+// with the numbers of a monitor and an update (3 for automatic step control, 4 for Langevin dynamics), and graphs "common" (hydrogens
 // on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other), "dense" (many bonds on one particle),
 // "expressions" (angles, and all functions), or "rare" with the number of a graph of up to eight constraints, for that alone.
 
@@ -63,12 +63,14 @@ int main(int argc, char** argv) {
     if (graphs == "large" || graphs == "dense")
         add(bonds);
     const int updateNumber = std::stoi(argv[3]);
-    const bool isAutomatic = updateNumber == 3;
+    const bool isAutomatic = updateNumber == 3, isLangevin = updateNumber == 4;
     vector<StepMonitor::Term> terms;
     if (!isAutomatic)
         terms.push_back({(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1});
-    const StepProgram::Update update =
-        isAutomatic ? StepProgram::Automatic : StepProgram::updateOf(terms, false, (StepDensity::Update) updateNumber);
+    const StepProgram::Update update = isAutomatic ? StepProgram::Automatic
+                                       : isLangevin
+                                           ? StepProgram::Langevin
+                                           : StepProgram::updateOf(terms, false, (StepDensity::Update) updateNumber);
     vector<ExpressionConstraint> expressions;
     if (graphs == "expressions") {
         expressions.push_back({"acos(d/sqrt(a*b))-angle; a=(x1-x2)^2+(y1-y2)^2+(z1-z2)^2;"

@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 
 CONSTRAINT_AND_APPLIED_FORCE, MULTIPLIER_P_NORM = 3, 4
-SEMI_EXPLICIT, EXPLICIT, AUTOMATIC = 0, 1, 3
+SEMI_EXPLICIT, EXPLICIT, AUTOMATIC, LANGEVIN = 0, 1, 3, 4
 # Precision, monitor, update, graphs, architectures. The program for SemiExplicit has every kernel, and the largest.
 CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
@@ -30,6 +30,9 @@ CASES = (
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_90",)),
     ("double", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "large", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "common", ("sm_70", "sm_90")),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "large", ("sm_70", "sm_90")),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "dense", ("sm_90",)),
     *(
         (precision, CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, kind, ("sm_90",))
         for precision, kind in (("mixed", "rare4"), ("double", "rare6"), ("mixed", "rare8"), ("double", "rare11"))

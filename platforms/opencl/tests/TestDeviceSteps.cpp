@@ -13,6 +13,7 @@
 #include "openmm/Integrator.h"
 #include "openmm/internal/ContextImpl.h"
 #include "openmm/opencl/OpenCLPlatform.h"
+#include "step/LangevinDynamics.h"
 #include "step/VRattleDynamics.h"
 #include <cmath>
 #include <memory>
@@ -939,6 +940,97 @@ void testExpressionCode() {
                                           std::to_string(expected[i]));
 }
 
+// LangevinDynamics and DeviceSteps side by side, with forces from one Context.
+struct BothLangevin {
+    Lender lender;
+    Context context;
+    LangevinDynamics dynamics;
+    DeviceSteps device;
+    const double stepSize = 0.001, tolerance;
+
+    BothLangevin(const Molecules& molecules, const std::string& precision) :
+            context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
+            dynamics(molecules.masses, molecules.constraints), device(lender.getDevice(), molecules.system),
+            tolerance(DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12)) {
+        LangevinSettings langevin;
+        langevin.temperature = 300;
+        langevin.friction = 5;
+        langevin.randomSeed = -123456789;
+        dynamics.setSettings({stepSize, tolerance, langevin});
+        dynamics.begin(molecules.positions, molecules.velocities, forcesAt(molecules.positions), 0);
+        dynamics.setRandomState({-123456789, 4294967290.0}); // whose lower word is soon over
+    }
+    vector<Vec3> forcesAt(const vector<Vec3>& positions) {
+        context.setPositions(positions);
+        lender.getContext().calcForcesAndEnergy(true, false, 1);
+        vector<Vec3> forces;
+        lender.getContext().getForces(forces);
+        return forces;
+    }
+    void stepOnHost() {
+        vector<Vec3> forces;
+        do {
+            dynamics.step(NO_LIMIT);
+            forces = forcesAt(dynamics.getNextPositions());
+        } while (!dynamics.finish(forces, 0));
+    }
+    void handOver() {
+        const LangevinDynamics::Noise noise = dynamics.findNoise();
+        DeviceSteps::Settings settings = {
+            stepSize, StepDensity(StepDensity::Explicit, stepSize, 0, 0), StepDensity::Explicit, true, tolerance, {}};
+        settings.langevin = DeviceSteps::Langevin{noise.damping, noise.size, dynamics.findFloor(),
+                                                  dynamics.getFollowingFactor(), dynamics.findLargestCalm()};
+        forcesAt(dynamics.getPositions());
+        context.setVelocities(dynamics.getVelocities());
+        device.setSettings(settings);
+        DeviceSteps::State state = {1, 0, false, 0};
+        state.reference = dynamics.getReferences()[0];
+        state.seed = (int64_t) dynamics.getRandomState()[0];
+        state.numDrawn = (int64_t) dynamics.getRandomState()[1];
+        ASSERT(device.begin(state, 0));
+    }
+    void stepOnDevice() {
+        device.advance(NO_LIMIT);
+        lender.getContext().calcForcesAndEnergy(true, false, 1);
+        device.finish(0);
+    }
+};
+
+// From a state in the middle of a run: the first calm steps, one and a hundred.
+void testLangevinAgrees(const Molecules& molecules, const std::string& precision, double distance, double fraction) {
+    BothLangevin both(molecules, precision);
+    for (int i = 0; i < 20; i++)
+        both.stepOnHost();
+    both.dynamics.setReferences({1.2 * both.dynamics.getMonitorValues()[0]});
+    both.handOver();
+    const long long substepped = both.dynamics.getNumSubstepped();
+    for (int steps : {1, 99}) {
+        const long long launches = both.device.getNumLaunches();
+        for (int i = 0; i < steps; i++)
+            both.stepOnDevice();
+        const LargeClusters& large = both.device.getLargeClusters();
+        const int perStep = large.isEmpty() ? 2 : !large.getForm().isStaged ? 4 : 2 + 3 + 28;
+        ASSERT_EQUAL(perStep * steps, both.device.getNumLaunches() - launches);
+        const DeviceSteps::Report report = both.device.read();
+        const vector<Vec3> positions = both.context.getState(OpenMM::State::Positions).getPositions();
+        const vector<Vec3> velocities = both.context.getState(OpenMM::State::Velocities).getVelocities();
+        for (int i = 0; i < steps; i++)
+            both.stepOnHost();
+        ASSERT_EQUAL(substepped, both.dynamics.getNumSubstepped());
+        ASSERT(!report.hasFailed);
+        ASSERT_EQUAL(steps, report.numSteps);
+        ASSERT_EQUAL_TOL(steps * both.stepSize, report.elapsed, 1e-6);
+        const double growth = steps == 1 ? 1 : 1000;
+        ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= growth * distance);
+        ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1000 * growth * distance);
+        ASSERT_EQUAL_TOL(both.dynamics.getMonitorValues()[0], report.values[0], growth * fraction);
+        ASSERT_EQUAL_TOL(both.dynamics.getReferences()[0], report.state.reference, fraction);
+        ASSERT_EQUAL(both.dynamics.getRandomState()[1], (double) report.state.numDrawn);
+        both.forcesAt(positions);
+        both.context.setVelocities(velocities);
+    }
+}
+
 // Which constraints the device solves, and which are left to the host.
 void testWhatItTakes() {
     ASSERT(DeviceSteps::canTake({}));
@@ -1015,6 +1107,16 @@ int main(int argc, char** argv) {
          [] { testFailureLeavesTheStateBefore("mixed", 400); }},
         {"a failure with automatic step control, double", [] { testFailureOfAutomaticControl("double"); }},
         {"expressions are written as they are evaluated", testExpressionCode},
+        {"Langevin, double", [] { testLangevinAgrees(Molecules(2), "double", 1e-12, 1e-9); }},
+        {"Langevin, mixed", [] { testLangevinAgrees(Molecules(2), "mixed", 1e-9, 1e-6); }},
+        {"Langevin, single", [] { testLangevinAgrees(Molecules(2), "single", 1e-6, 1e-4); }},
+        {"Langevin, large clusters, double",
+         [] { testLangevinAgrees(makeMolecules({makeChain(20), makeProtein(8)}), "double", 1e-12, 1e-9); }},
+        {"Langevin, large clusters in pieces, double",
+         [] {
+             testLangevinAgrees(makeMolecules({makeRing(30), makeChain(400), makeProtein(30), makeStar(4, 60)}),
+                                "double", 1e-12, 1e-9);
+         }},
         {"what it takes", testWhatItTakes}};
     if (argc > 1)
         tests = {tests.at(std::stoi(argv[1]))};

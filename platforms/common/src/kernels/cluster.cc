@@ -102,6 +102,15 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isPushed, force), r, L, v, w, x1, sums);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = x1[k];
+#if CLUSTER_SUMS
+    mixed net[NUM_ATOMS][3], share = 0; // M^-1 (F - G^T Lambda)
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]);
+    push_KIND(r, w, x1, -1, net);
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+        share += shareOf(dot3(net[i], net[i]), w[i], v[i]);
+    isRegular = addCluster(sums, share) && isRegular;
+#endif
 #if UPDATE == AUTOMATIC
     mixed net[NUM_ATOMS][3]; // M^-1 (F - G^T Lambda)
     UNROLL for (int i = 0; i < NUM_ATOMS; i++)
@@ -134,8 +143,8 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     return isRegular;
 }
 
-/** The velocities after the kick of a step of size dt. */
-inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed dt, mixed* w, mixed (*v)[3]) {
+/** The velocities after a kick for that time. */
+inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed kick, mixed* w, mixed (*v)[3]) {
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         const bool isReady = (NUM_CONSTRAINTS > 5 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
@@ -143,21 +152,22 @@ inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* 
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
         UNROLL for (int d = 0; d < 3; d++)
-            v[i][d] += dt/2*a[d];
+            v[i][d] += kick*a[d];
     }
 }
 
 /**
- * Solve g(q + dt (v + M^-1 G^T gamma/dt)) = 0 by Newton's iteration from gamma = -dt^2/2 lambda; v are the kicked velocities. Returns
+ * Solve g(q + dt (v + M^-1 G^T gamma/dt)) = 0 by Newton's iteration from gamma = -kick dt lambda; v are the velocities after a
+ * kick for that time. Returns
  * the number of iterations, or -1 if they do not converge. There is at least one, since lambda itself, unrefined, costs accuracy even
  * where it meets the tolerance.
  */
-inline DEVICE int constrain_KIND(int c, mixed dt, mixed tolerance, GLOBAL const mixed* RESTRICT lengths, GLOBAL const mixed* RESTRICT multipliers,
+inline DEVICE int constrain_KIND(int c, mixed kick, mixed dt, mixed tolerance, GLOBAL const mixed* RESTRICT lengths, GLOBAL const mixed* RESTRICT multipliers,
         mixed (*r)[3], mixed* w, mixed (*v)[3], mixed* gamma) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed s[NUM_CONSTRAINTS][3];
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
-        gamma[k] = -dt*dt/2*multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c];
+        gamma[k] = -kick*dt*multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c];
         UNROLL for (int d = 0; d < 3; d++)
             s[k][d] = r[k][d] + dt*(v[first[k]][d] - v[second[k]][d]);
     }
@@ -193,20 +203,23 @@ inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed
     mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
     const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
-    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
-    const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt/2, w, v);
+    const int iterations = constrain_KIND(c, dt/2, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) // where the next trial starts
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
             multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = -2*gamma[k]/(dt*dt);
-    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), dt, w, v);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), dt/2, w, v);
     push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
     const bool isRegular = factorize_KIND(r, w, L);
     measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isRegular, force), r, L, v, w, gamma, sums);
     return isRegular && iterations >= 0;
 }
 
-/** (3.9)-(3.11); returns the number of iterations, or -1 if they do not converge. */
-inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities) {
+/**
+ * A kick and a drift (3.9)-(3.11), for these times; in Langevin dynamics noise follows, and the drift once more. Returns the number of
+ * iterations, or -1 if they do not converge.
+ */
+inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities NOISE_PARAMETERS) {
     mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], gamma[NUM_CONSTRAINTS];
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
@@ -217,15 +230,38 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GL
     }
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
     const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
-    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt, w, v);
-    const int iterations = constrain_KIND(c, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), kick, w, v);
+    int iterations = constrain_KIND(c, kick, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+#if UPDATE == LANGEVIN
+    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
+    mixed middle[NUM_ATOMS][3];
+    push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+        loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, middle[i]);
+        UNROLL for (int d = 0; d < 3; d++)
+            middle[i][d] += dt*v[i][d];
+        addNoise(noise, atomIndex[atom], w[i], v[i]);
+    }
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+        UNROLL for (int d = 0; d < 3; d++)
+            r[k][d] = middle[first[k]][d] - middle[second[k]][d];
+    const int more = constrain_KIND(c, 0, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+    iterations = (iterations >= 0 && more >= 0 ? iterations + more : -1);
+#endif
     if (iterations >= 0) {
-        loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), dt, w, v);
+#if UPDATE != LANGEVIN
+        loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), kick, w, v);
+#endif
         push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
         UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
             const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
             mixed x[3];
             const real charge = loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, x);
+#if UPDATE == LANGEVIN
+            UNROLL for (int d = 0; d < 3; d++)
+                x[d] = middle[i][d];
+#endif
             storePosition(posq, posqCorrection, atom, x[0] + dt*v[i][0], x[1] + dt*v[i][1], x[2] + dt*v[i][2], charge);
             velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
         }

@@ -25,7 +25,11 @@
 #define MULTIPLIERS 2
 #define HALF_MULTIPLIERS 3
 #define COMPLETE 4
-#define NUM_PHASES 5
+// In Langevin dynamics the noise has been added, and the second half of the drift is on its way.
+#define AFTER_NOISE 5
+#define SECOND_POSITIONS 6
+#define NUM_PHASES 7
+#define IS_OF_POSITIONS(phase) ((phase) == POSITIONS || (phase) >= AFTER_NOISE)
 
 #define FACTORIZE 0
 #define FORWARD 1
@@ -43,7 +47,6 @@
 #define HIGH(word) ((int) ((word) >> 16))
 #define WORDS_PER_VALUE ((int) (sizeof(mixed)/4))
 
-typedef unsigned int word_t;
 #if USE_RECORDS
 typedef unsigned short index_t;
 #else
@@ -281,12 +284,27 @@ inline DEVICE bool receiveValues(const int count, GLOBAL volatile const mm_ulong
         GLOBAL const mm_long* RESTRICT force, GLOBAL int* RESTRICT failure
 #define LARGE_STATE_ARGUMENTS paddedNumAtoms, posq, posqCorrection, velm, force, failure
 
+/** The entries of K between rows of a piece; its diagonal is there. */
+inline DEVICE void coupleRows(int numCouplings, MEMORY const int* couplings, MEMORY const mixed* W, MEMORY const real* R, MEMORY real* A) {
+    KEEP_LOOP for (int i = THREAD; i < numCouplings; i += NUM_THREADS) {
+        MEMORY const int* coupling = couplings + 5*i;
+        const int k = coupling[1], l = coupling[2];
+        real weight = 0;
+        UNROLL for (int shared = 3; shared < 5; shared++) {
+            const int code = coupling[shared]; // twice the particle, + 1 where the signs differ; -1 for none
+            const mixed w = W[code < 0 ? 0 : code>>1];
+            weight += (real) (code < 0 ? 0 : (code & 1) != 0 ? -w : w);
+        }
+        A[coupling[0]] = weight*(R[3*k]*R[3*l] + R[3*k+1]*R[3*l+1] + R[3*k+2]*R[3*l+2]);
+    }
+}
+
 /** What a launch does with a piece. */
 typedef struct {
     int step, firstStage, endStage;
     int numProjections;  // solutions for the velocities
     word_t stamp;        // of stage 0
-    mixed dt;            // of the step; of the kick in finish
+    mixed kick, dt;      // the times of the kick and of the drift
     mixed halfKick;      // to the half-step velocities, where they are formed from the on-step ones
     int formHalf;
     int isWritten;       // positions and velocities are changed
@@ -302,7 +320,7 @@ typedef struct {
  * not converged in all stages there are.
  */
 inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARAMETERS, LARGE_STATE_PARAMETERS,
-        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, mixed* sums, mixed* halfSums, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, mixed* sums, mixed* halfSums, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags NOISE_PARAMETERS) {
     const int4 first = pieces[4*piece], second = pieces[4*piece+1], third = pieces[4*piece+2], fourth = pieces[4*piece+3];
     const int firstRow = first.z, numInner = first.w, numBorders = second.x, firstAtom = second.y, numAtoms = second.z, firstJoint = second.w, numJoints = third.x;
     const int numRows = numInner + numBorders, numKept = third.z;
@@ -375,7 +393,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             }
         }
         if (mode != FINISH) {
-            gamma[k] = -task.dt*task.dt/2*largeMultipliers[NUMBER_OF(row)];
+            gamma[k] = -task.kick*task.dt*largeMultipliers[NUMBER_OF(row)];
             x[k] = (real) gamma[k];
         }
         if (k < numInner) {
@@ -419,7 +437,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             oldVelocities[atom] = make_mixed4(v[0], v[1], v[2], W[i]);
         }
         UNROLL for (int d = 0; d < 3; d++) {
-            D[3*i+d] = (mode == FINISH ? v[d] + task.dt*a[d] : task.dt*(v[d] + task.dt/2*a[d]));
+            D[3*i+d] = (mode == FINISH ? v[d] + task.kick*a[d] : task.dt*(v[d] + task.kick*a[d]));
 #if HALF_SUMS || UPDATE == AUTOMATIC
             if (mode == FINISH)
                 before[3*i+d] = v[d];
@@ -457,6 +475,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     #define RUN_FACTORIZE(LEVELS) runLevels(FACTORIZE, LEVELS, numWide, starts, tables, more, A, x)
     #define RUN_FORWARD(LEVELS) runLevels(FORWARD, LEVELS, numWide, starts + numLevels + 2, tables, more, A, x)
     #define RUN_BACKWARD(LEVELS) runLevels(BACKWARD, LEVELS, numWide, starts + 2*(numLevels + 2), tables, more, A, x)
+    #define SCALE_FACTOR(LEVELS) scaleFactor(LEVELS, starts + 2*(numLevels + 2), tables, A, x)
 #else
     MEMORY const int* starts = header + header[6];
     MEMORY const int* columnStart = header + header[7];
@@ -469,6 +488,20 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     #define RUN_FACTORIZE(LEVELS) RUN_ROWS(FACTORIZE, LEVELS)
     #define RUN_FORWARD(LEVELS) RUN_ROWS(FORWARD, LEVELS)
     #define RUN_BACKWARD(LEVELS) RUN_ROWS(BACKWARD, LEVELS)
+    #define SCALE_FACTOR(LEVELS) scaleFactor((LEVELS) > 0 ? numRows : 0, columnStart, A + numRows, A, x)
+#endif
+    // The factor of a matrix that is new, and what the joints need of it.
+    #define FACTORIZE_FRESH(LEVELS) { \
+        RUN_FACTORIZE(LEVELS); \
+        isRegular = SCALE_FACTOR(LEVELS) && isRegular; \
+    }
+#if HAS_JOINTS
+    #define SEND_CONTRIBUTIONS(CONDITION, STAMP) { \
+        KEEP_LOOP for (int i = THREAD; i < ((CONDITION) ? numBorders + numBorderEntries : 0); i += NUM_THREADS) \
+            sendValue(channel + WORDS_PER_VALUE*(16*numJoints + firstContribution + i), 1, A[i < numBorders ? numInner + i : firstBorderEntry + i - numBorders], STAMP); \
+    }
+#else
+    #define SEND_CONTRIBUTIONS(CONDITION, STAMP)
 #endif
 #if HAS_JOINTS
     MEMORY const int* borders = header + header[8];
@@ -483,32 +516,11 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
     MEMORY real* J = partSums + SPLIT*numBorders; // the joints' matrix
 #endif
 
-    // K; its diagonal is there
-    KEEP_LOOP for (int i = THREAD; i < (mode == FINISH && isBeginning ? numCouplings : 0); i += NUM_THREADS) {
-        MEMORY const int* coupling = couplings + 5*i;
-        const int k = coupling[1], l = coupling[2];
-        real weight = 0;
-        UNROLL for (int shared = 3; shared < 5; shared++) {
-            const int code = coupling[shared]; // twice the particle, + 1 where the signs differ; -1 for none
-            const mixed w = W[code < 0 ? 0 : code>>1];
-            weight += (real) (code < 0 ? 0 : (code & 1) != 0 ? -w : w);
-        }
-        A[coupling[0]] = weight*(R[3*k]*R[3*l] + R[3*k+1]*R[3*l+1] + R[3*k+2]*R[3*l+2]);
-    }
+    coupleRows(mode == FINISH && isBeginning ? numCouplings : 0, couplings, W, R, A);
     SYNC_PIECE;
 
-    const int numFresh = (mode == FINISH && isBeginning ? numLevels : 0);
-    RUN_FACTORIZE(numFresh);
-#if USE_RECORDS
-    isRegular = scaleFactor(numFresh, starts + 2*(numLevels + 2), tables, A, x) && isRegular;
-#else
-    isRegular = scaleFactor(numFresh > 0 ? numRows : 0, columnStart, A + numRows, A, x) && isRegular;
-#endif
-#if HAS_JOINTS
-    if (mode == FINISH)
-        KEEP_LOOP for (int i = THREAD; i < (isBeginning ? numBorders + numBorderEntries : 0); i += NUM_THREADS)
-            sendValue(channel + WORDS_PER_VALUE*(16*numJoints + firstContribution + i), 1, A[i < numBorders ? numInner + i : firstBorderEntry + i - numBorders], task.stamp);
-#endif
+    FACTORIZE_FRESH(mode == FINISH && isBeginning ? numLevels : 0)
+    SEND_CONTRIBUTIONS(mode == FINISH && isBeginning, task.stamp)
 
     // --------------------------------------------------------------------------------------------------------- the stages
     int completed = 0;
@@ -529,7 +541,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                 s[d] = sent[1+d] - sent[5+d];
             }
             const mixed square = dot3(s, s), product = dot3(r, s);
-            const mixed right = (phase == POSITIONS ? -(jointConstants[j] + product + square/2) : phase == VELOCITIES ? -product : square + jointPulls[j]);
+            const mixed right = (IS_OF_POSITIONS(phase) ? -(jointConstants[j] + product + square/2) : phase == VELOCITIES ? -product : square + jointPulls[j]);
             jointRight[j] = right;
             jointSums[j] = right + sent[0] + sent[4];
             if (!isConverged || !(fabs(right) <= task.tolerance*dot3(r, r)))
@@ -537,7 +549,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         }
         SYNC_PIECE;
         // The joints' matrix, at first.
-        if (mode == FINISH && stage == 1 && numJoints > 0) {
+        if (((mode == FINISH && stage == 1) || phase == AFTER_NOISE) && numJoints > 0) {
             GLOBAL volatile const mm_ulong* contributions = channel + 16*WORDS_PER_VALUE*numJoints;
             KEEP_LOOP for (int i = THREAD; i < numJoints + numJointEntries; i += NUM_THREADS) {
                 mixed sum = 0;
@@ -547,7 +559,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     const bool isPair = (at + 1 < end);
                     mixed values[2];
                     receiveValues(2, contributions + WORDS_PER_VALUE*sources[at], WORDS_PER_VALUE*((int) sources[isPair ? at + 1 : at] - (int) sources[at]),
-                            1, task.stamp, values);
+                            1, lastStamp, values);
                     sum += values[0] + (isPair ? values[1] : (mixed) 0);
                 }
                 J[i] = (real) sum;
@@ -566,8 +578,23 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
 #else
         SYNC_PIECE;
 #endif
-        const bool isConverged = (phase == POSITIONS && stage > 1 && flags[now^1] == 0);
+        const bool isOfPositions = IS_OF_POSITIONS(phase);
+        const bool isConverged = ((phase == POSITIONS ? stage > 1 : phase == SECOND_POSITIONS) && flags[now^1] == 0);
         const bool isSolved = (isUnderWay && !isConverged);
+        // In the middle of the drift noise is added, and the constraints are those there.
+        const bool isTurning = (UPDATE == LANGEVIN && mode == ADVANCE && phase == POSITIONS && isConverged), isAtEnd = (mode == ADVANCE && isConverged && !isTurning);
+#if HAS_JOINTS && UPDATE == LANGEVIN
+        KEEP_LOOP for (int j = THREAD; j < (isTurning ? numJoints : 0); j += NUM_THREADS) {
+            mixed sent[8], r[3], s[3];
+            receiveValues(8, inbox + j, WORDS_PER_VALUE*numJoints, numJoints, lastStamp, sent);
+            UNROLL for (int d = 0; d < 3; d++) {
+                r[d] = jointVectors[3*j+d];
+                s[d] = sent[1+d] - sent[5+d];
+                jointVectors[3*j+d] = r[d] + s[d];
+            }
+            jointConstants[j] += dot3(r, s) + dot3(s, s)/2;
+        }
+#endif
 #if HAS_JOINTS
         // For each border by a few threads.
         KEEP_LOOP for (int i = THREAD; i < (isSolved ? SPLIT*numBorders : 0); i += NUM_THREADS) {
@@ -589,12 +616,13 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         RUN_BACKWARD(isSolved ? numLevels : 0);
         const bool isLastProjection = (phase == VELOCITIES && stage >= task.numProjections);
         const int nextPhase = (!isUnderWay ? phase :
-                phase == POSITIONS ? (!isConverged ? POSITIONS : mode == TRY ? MULTIPLIERS : COMPLETE) :
+                phase == POSITIONS ? (!isConverged ? POSITIONS : mode == TRY ? MULTIPLIERS : isTurning ? AFTER_NOISE : COMPLETE) :
+                isOfPositions ? (isConverged ? COMPLETE : SECOND_POSITIONS) :
                 phase == VELOCITIES ? (isLastProjection ? MULTIPLIERS : VELOCITIES) :
                 phase == MULTIPLIERS && mode == FINISH && HALF_SUMS ? HALF_MULTIPLIERS : COMPLETE);
         const bool isMeasured = (phase == MULTIPLIERS || phase == HALF_MULTIPLIERS);
         KEEP_LOOP for (int k = THREAD; k < (isUnderWay ? numRows : 0); k += NUM_THREADS) {
-            if (phase == POSITIONS && !isConverged)
+            if (isOfPositions && !isConverged)
                 gamma[k] += x[k];
             if (mode == TRY && isConverged) {
                 const int4 row = rows[firstRow+k];
@@ -618,7 +646,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                 }
             }
         }
-        const bool isMoved = (phase == VELOCITIES ? isUnderWay : phase == POSITIONS && !isConverged);
+        const bool isMoved = (phase == VELOCITIES ? isUnderWay : isOfPositions && !isConverged);
         KEEP_LOOP for (int i = THREAD; i < numAtoms; i += NUM_THREADS) {
             real push[3] = {0, 0, 0};
             const int begin = incidenceStart[i], end = (isMoved || isMeasured ? incidenceStart[i+1] : begin);
@@ -652,6 +680,11 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     addAutomaticTerms(sums, task.last, atom, w, v, a);
                 }
 #endif
+#if CLUSTER_SUMS
+                UNROLL for (int d = 0; d < 3; d++)
+                    a[d] -= w*push[d];
+                sums[PIECE_SHARE] += shareOf(dot3(a, a), w, v);
+#endif
 #if HALF_SUMS
                 if (mode == FINISH)
                     UNROLL for (int d = 0; d < 3; d++)
@@ -660,7 +693,19 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             }
             if (mode == FINISH && isLastProjection && isUnderWay && task.isWritten)
                 velm[pieceAtoms[firstAtom+i]] = make_mixed4(v[0], v[1], v[2], w);
-            if (mode == ADVANCE && isConverged && task.dt > 0) {
+#if UPDATE == LANGEVIN
+            if (isTurning) {
+                const mixed inverse = 1/task.dt;
+                UNROLL for (int d = 0; d < 3; d++) {
+                    before[3*i+d] += v[d];
+                    v[d] *= inverse;
+                }
+                addNoise(noise, atomIndex[pieceAtoms[firstAtom+i]], w, v);
+                UNROLL for (int d = 0; d < 3; d++)
+                    v[d] *= task.dt;
+            }
+#endif
+            if (isAtEnd && task.dt > 0) {
                 const int atom = pieceAtoms[firstAtom+i];
                 storePosition(posq, posqCorrection, atom, before[3*i] + v[0], before[3*i+1] + v[1], before[3*i+2] + v[2], charges[i]);
                 const mixed inverse = 1/task.dt;
@@ -669,13 +714,45 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
             UNROLL for (int d = 0; d < 3; d++)
                 D[3*i+d] = (mode == TRY && isConverged ? v[d]/task.dt : v[d]);
         }
-        if (mode == ADVANCE && isConverged && THREAD == 0)
+        if (isAtEnd && THREAD == 0)
             largeIterations[piece] += stage - 1;
         if (mode != ADVANCE && isMeasured)
             completed |= (phase == MULTIPLIERS ? 1 : 2);
         phase = nextPhase;
         SYNC_PIECE;
 
+#if UPDATE == LANGEVIN
+        // The vectors and K in the middle.
+        KEEP_LOOP for (int k = THREAD; k < (isTurning ? numRows : 0); k += NUM_THREADS) {
+            const int i = ends[2*k], j = ends[2*k+1]; // of another piece where they are less than zero
+            mixed r[3], last[3];
+            UNROLL for (int d = 0; d < 3; d++) {
+#if HAS_JOINTS
+                r[d] = (k < numInner ? before[3*(i < 0 ? 0 : i)+d] - before[3*(j < 0 ? 0 : j)+d] : jointVectors[3*(k < numInner ? 0 : borders[k-numInner]>>1)+d]);
+#else
+                r[d] = before[3*i+d] - before[3*j+d];
+#endif
+                R[3*k+d] = (real) r[d];
+            }
+            const mixed own = (i < 0 ? (mixed) 0 : W[i < 0 ? 0 : i]) + (j < 0 ? (mixed) 0 : W[j < 0 ? 0 : j]);
+            x[k] = A[k] = (real) (own*dot3(r, r));
+            if (k < numInner) {
+                UNROLL for (int d = 0; d < 3; d++) {
+                    last[d] = vectors[3*k+d];
+                    vectors[3*k+d] = r[d];
+                }
+                constants[k] += (dot3(r, r) - dot3(last, last))/2;
+            }
+        }
+        KEEP_LOOP for (int i = numRows + THREAD; i < (isTurning ? numKept : 0); i += NUM_THREADS)
+            A[i] = 0;
+        SYNC_PIECE;
+        coupleRows(isTurning ? numCouplings : 0, couplings, W, R, A);
+        SYNC_PIECE;
+        FACTORIZE_FRESH(isTurning ? numLevels : 0)
+        SEND_CONTRIBUTIONS(isTurning, task.stamp + (word_t) stage)
+        SYNC_PIECE;
+#endif
         // The next right-hand sides.
         KEEP_LOOP for (int k = THREAD; k < (phase != COMPLETE ? numRows : 0); k += NUM_THREADS) {
             mixed right = 0;
@@ -687,7 +764,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     s[d] = D[3*i+d] - D[3*j+d];
                 }
                 const mixed square = dot3(s, s), product = dot3(r, s);
-                if (phase == POSITIONS) {
+                if (IS_OF_POSITIONS(phase)) {
                     right = -(constants[k] + product + square/2);
                     if (!(fabs(right) <= task.tolerance*dot3(r, r)))
                         flags[now] = 1;
@@ -701,12 +778,12 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         }
         SYNC_PIECE;
         // At least one solution, since the multipliers of the state at the beginning are not those of the step.
-        const bool isFine = (phase == POSITIONS && stage > 0 && flags[now] == 0);
+        const bool isFine = ((phase == POSITIONS ? stage > 0 : phase == SECOND_POSITIONS) && flags[now] == 0);
         KEEP_LOOP for (int k = THREAD; k < (isFine ? numInner : 0); k += NUM_THREADS)
             x[k] = 0;
 #if HAS_JOINTS
         // The particles of the joints are sent first, since they are known.
-        const word_t stamp = (task.stamp + (word_t) stage) | (phase == POSITIONS && !isFine ? 0x80000000u : 0u);
+        const word_t stamp = (task.stamp + (word_t) stage) | (IS_OF_POSITIONS(phase) && !isFine ? 0x80000000u : 0u);
         const int numSent = (phase != COMPLETE ? numBorders : 0), stride = WORDS_PER_VALUE*numJoints;
         GLOBAL volatile mm_ulong* outbox = channel + now*8*stride;
         KEEP_LOOP for (int b = THREAD; b < numSent; b += NUM_THREADS) {
@@ -742,11 +819,14 @@ inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask 
     KEEP_LOOP for (; piece < numPieces; piece += stride) {
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = halfSums[j] = 0;
-        const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
+        const int completed = runPiece(FINISH, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags NO_NOISE);
         MERGE_SUMS(sums);
 #if UPDATE == AUTOMATIC
         if (THREAD == 0 && task.canFail && (completed & 1) != 0)
             closePiece(sums, task.last, pieceAtoms[pieces[4*piece+1].y], pieces[4*piece+3].w);
+#endif
+#if CLUSTER_SUMS
+        sums[PIECE_COUNT] = pieces[4*piece+3].w;
 #endif
         if (THREAD == 0 && task.canFail && (completed & 1) != 0)
             for (int j = 0; j < NUM_SUMS; j++)
@@ -784,22 +864,23 @@ inline DEVICE void tryPieces(int piece, int numPieces, int stride, LargeTask tas
 
 /** The first half of a step; see advanceStep. */
 inline DEVICE void advancePieces(int piece, int numPieces, int stride, LargeTask task, int isLast, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities,
-        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags) {
+        LARGE_STATE_PARAMETERS, LARGE_PARAMETERS, LOCAL_ARG uint4* memory, LOCAL_ARG int* flags NOISE_PARAMETERS) {
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     KEEP_LOOP for (; piece < numPieces; piece += stride) {
-        const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, memory, flags);
+        const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, memory, flags NOISE_ARGUMENTS);
         if (THREAD == 0 && isLast && (completed & 4) != 0)
             fail(failure, task.step, NOT_CONVERGED + NUM_CODES*piece);
     }
 }
 
-inline DEVICE LargeTask makeTask(int step, int firstStage, int endStage, int stamp, mixed dt, mixed tolerance) {
+inline DEVICE LargeTask makeTask(int step, int firstStage, int endStage, int stamp, mixed kick, mixed dt, mixed tolerance) {
     LargeTask task;
     task.step = step;
     task.firstStage = firstStage;
     task.endStage = endStage;
     task.numProjections = 0;
     task.stamp = (word_t) stamp;
+    task.kick = kick;
     task.dt = dt;
     task.halfKick = 0;
     task.formHalf = 0;
@@ -808,8 +889,8 @@ inline DEVICE LargeTask makeTask(int step, int firstStage, int endStage, int sta
     return task;
 }
 
-inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage, int stamp, int numProjections, mixed dt, mixed halfKick, bool formHalf, bool isStored, bool isFrozen LAST_STATE_PARAMETER) {
-    LargeTask task = makeTask(step, firstStage, endStage, stamp, dt, 0);
+inline DEVICE LargeTask makeFinishingTask(int step, int firstStage, int endStage, int stamp, int numProjections, mixed kick, mixed halfKick, bool formHalf, bool isStored, bool isFrozen LAST_STATE_PARAMETER) {
+    LargeTask task = makeTask(step, firstStage, endStage, stamp, kick, 0, 0);
     task.numProjections = numProjections;
     task.halfKick = halfKick;
     task.formHalf = formHalf;
@@ -850,7 +931,8 @@ KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int sta
         GLOBAL mixed* RESTRICT nextPartials, int numPartials, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
     LARGE_MEMORY
     const bool isTrying = (nextTrial[TRIAL_STATUS] == TRYING && !IS_FROZEN(failure, step));
-    const LargeTask task = makeTask(step, firstStage, endStage, stamp, (mixed) (settings[NOMINAL]/nextTrial[TRIAL_DENSITY]), tolerance);
+    const mixed dt = (mixed) (settings[NOMINAL]/nextTrial[TRIAL_DENSITY]);
+    const LargeTask task = makeTask(step, firstStage, endStage, stamp, dt/2, dt, tolerance);
     tryPieces(isTrying ? GROUP_ID : numPieces, numPieces, NUM_GROUPS, task, isLast, nextPartials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
 }
 
@@ -858,12 +940,16 @@ KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int sta
 
 /** advanceStep for the pieces, which takes the step size that that has found. */
 KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions,
-        GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS) {
+        GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS LARGE_NOISE_STATE) {
     LARGE_MEMORY
     // Only what earlier launches have written may decide, or the groups of one cluster would not agree: this one writes other codes.
     const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
-    const LargeTask task = makeTask(step, firstStage, endStage, stamp, (mixed) nextControl[STEP_SIZE], tolerance);
-    advancePieces(isFrozen ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags);
+    const mixed dt = (mixed) nextControl[STEP_SIZE];
+    const LargeTask task = makeTask(step, firstStage, endStage, stamp, dt/2, UPDATE == LANGEVIN ? dt/2 : dt, tolerance);
+#if UPDATE == LANGEVIN
+    const Noise noise = makeNoise(step, noiseState, settings);
+#endif
+    advancePieces(isFrozen ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags NOISE_ARGUMENTS);
 }
 
 #endif

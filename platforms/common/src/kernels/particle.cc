@@ -26,7 +26,11 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     addAutomaticTerms(terms, last, atom, inverseMass, v, a);
     addCluster(sums, terms, last, atom);
 #endif
+#if CLUSTER_SUMS
+    return addCluster(sums, shareOf(dot3(a, a), inverseMass, v)) && forceSquared >= 0;
+#else
     return forceSquared >= 0;
+#endif
 }
 
 inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed* sums) {
@@ -40,7 +44,7 @@ inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed
     return true;
 }
 
-inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities) {
+inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities NOISE_PARAMETERS) {
     const int atom = atoms[ATOM_BASE + c];
     mixed x[3], v[3], a[3];
     const real charge = loadPosition(posq, posqCorrection, atom, x);
@@ -49,7 +53,12 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, GL
     oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
     oldVelocities[atom] = make_mixed4(v[0], v[1], v[2], inverseMass);
     UNROLL for (int d = 0; d < 3; d++)
-        v[d] += dt/2*a[d];
+        v[d] += kick*a[d];
+#if UPDATE == LANGEVIN
+    UNROLL for (int d = 0; d < 3; d++)
+        x[d] += dt*v[d];
+    addNoise(noise, atomIndex[atom], inverseMass, v);
+#endif
     storePosition(posq, posqCorrection, atom, x[0] + dt*v[0], x[1] + dt*v[1], x[2] + dt*v[2], charge);
     velm[atom] = make_mixed4(v[0], v[1], v[2], inverseMass);
     return 0;

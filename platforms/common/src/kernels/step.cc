@@ -10,6 +10,7 @@
 #define UNROLL _Pragma("unroll")
 
 typedef WIDE wide;
+typedef unsigned int word_t;
 
 inline DEVICE mixed dot3(const mixed* a, const mixed* b) {
     return a[0]*b[0] + a[1]*b[1] + a[2]*b[2];
@@ -89,6 +90,21 @@ inline DEVICE void addParticleTerms(mixed* sums, mixed forceSquared, mixed w, co
     PARTICLE_TERMS
 }
 
+#if CLUSTER_SUMS
+
+/** What a particle with inverse mass w and the net acceleration, applied and of constraints, gives to the sum A_c of its cluster. */
+inline DEVICE mixed shareOf(mixed netSquared, mixed w, const mixed* v) {
+    return SHARE_TERM;
+}
+
+/** Add a whole cluster; returns false if its sum is no number. */
+inline DEVICE bool addCluster(mixed* sums, mixed share) {
+    CLUSTER_TERMS
+    return share < (mixed) 1e37f;
+}
+
+#endif
+
 inline DEVICE void mergeSums(mixed* sums, const mixed* other) {
     MERGE_TERMS
 }
@@ -138,6 +154,19 @@ inline DEVICE void gatherSums(int numPartials, GLOBAL const mixed* RESTRICT part
         mixed other[NUM_SUMS];
         for (int j = 0; j < NUM_SUMS; j++)
             other[j] = partials[j*numPartials + i];
+#if CLUSTER_SUMS && NUM_PIECES > 0
+        // The pieces of large clusters come last, one cluster after the other. The first of each knows how many there are.
+        if (i >= numPartials - NUM_PIECES) {
+            mixed share = 0;
+            const int end = i + (int) other[PIECE_COUNT];
+            for (int piece = i; piece < end; piece++)
+                share += partials[PIECE_SHARE*numPartials + piece];
+            for (int j = 0; j < NUM_SUMS; j++)
+                other[j] = 0;
+            if (end > i && !addCluster(other, share))
+                other[PIECE_SHARE] = 1; // which it is not otherwise
+        }
+#endif
         mergeSums(sums, other);
     }
 #if NUM_APART > 0
@@ -155,7 +184,7 @@ inline DEVICE wide boundedUpdate(wide u, wide rho, wide a) {
 
 /** The density of the next step where it follows from what is known on the step: the updates Explicit (3.15) and Bounded. */
 inline DEVICE wide nextDensity(wide u, const wide* now, GLOBAL const wide* RESTRICT settings) {
-#if UPDATE == FIXED
+#if UPDATE == FIXED || UPDATE == LANGEVIN
     return 1;
 #elif UPDATE == BOUNDED
     return boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
@@ -201,6 +230,8 @@ inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
 // The same address, which a compiler does not know, and not before the condition: it loads anew what it would else have to keep.
 #define AGAIN(condition, pointer) ((pointer) + ((condition) && paddedNumAtoms < 0 ? 1 : 0))
 #define CLUSTER_ARGUMENTS paddedNumAtoms, atoms, lengths, posq, posqCorrection, velm, force, multipliers
+
+LANGEVIN_FUNCTIONS
 
 CLUSTER_FUNCTIONS
 
@@ -316,7 +347,13 @@ KERNEL void evaluateState(int step, int change, wide groupEnergy, int numPartial
         if (control[IS_HALF_KNOWN] == 0)
             control[HALF_U] = evaluateMonitors(halfSums, groupEnergy, settings, values);
 #endif
-        const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+        wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+#if UPDATE == LANGEVIN
+        u = judgeCalm(u, control[REFERENCE], settings);
+        if (u >= 0 && control[IS_FOLLOWED] == 0)
+            control[REFERENCE] = followReference(u, control[REFERENCE], settings);
+        control[IS_FOLLOWED] = 1;
+#endif
         if (u < 0)
             fail(failure, step, INVALID_MONITOR);
         else {
@@ -408,7 +445,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
     const mixed dt = (mixed) shared[0];
 #if IS_FUSED
     if (GROUP_ID < NUM_FUSED) {
-        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, dt, tolerance);
+        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, dt/2, dt, tolerance);
         tryPieces(dt > 0 ? GROUP_ID : NUM_FUSED, NUM_FUSED, NUM_FUSED, task, 1, nextPartials, numPartials, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, buffer, memory, flags);
         return;
     }
@@ -436,7 +473,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
  */
 KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed tolerance, int numPartials, GLOBAL const wide* RESTRICT control, GLOBAL wide* RESTRICT nextControl,
         GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials, GLOBAL const wide* RESTRICT lastTrial, GLOBAL const mixed* RESTRICT lastPartials,
-        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS FUSED_PARAMETERS) {
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS FUSED_PARAMETERS NOISE_STATE) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     FUSED_MEMORY
     LOCAL wide shared[2];
@@ -468,11 +505,16 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         acceptAutomaticStep(sums, now, settings);
         wide rho = nextAutomaticDensity(now, settings);
 #else
-        const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+        wide u = evaluateMonitors(sums, groupEnergy, settings, values);
         const bool isSolved = true;
         wide rho = nextDensity(u, now, settings);
 #endif
-#if UPDATE == SUM || UPDATE == SEMI_EXPLICIT
+#if UPDATE == LANGEVIN
+        u = judgeCalm(u, now[REFERENCE], settings);
+        if (now[IS_FOLLOWED] == 0)
+            now[REFERENCE] = followReference(u, now[REFERENCE], settings);
+        now[IS_FOLLOWED] = 0;
+#elif UPDATE == SUM || UPDATE == SEMI_EXPLICIT
         // A rescue: the sum gave no step, or one far above the maximum.
         if (!(rho > 0) || rho < settings[SMALLEST]/2) {
             rho = boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
@@ -493,11 +535,14 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         }
     }
     SYNC_THREADS;
-    const mixed dt = (mixed) shared[0];
+    const mixed dt = (mixed) shared[0], kick = dt/2, drift = (UPDATE == LANGEVIN ? dt/2 : dt);
+#if UPDATE == LANGEVIN
+    const Noise noise = makeNoise(step, noiseState, settings);
+#endif
 #if IS_FUSED
     if (GROUP_ID < NUM_FUSED) {
-        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, dt, tolerance);
-        advancePieces(dt >= 0 ? GROUP_ID : NUM_FUSED, NUM_FUSED, NUM_FUSED, task, 1, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags);
+        const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, kick, drift, tolerance);
+        advancePieces(dt >= 0 ? GROUP_ID : NUM_FUSED, NUM_FUSED, NUM_FUSED, task, 1, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags NOISE_ARGUMENTS);
         return;
     }
 #endif
