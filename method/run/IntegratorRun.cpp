@@ -349,6 +349,12 @@ vector<double> IntegratorRun::getMultipliers() {
     return device.getMultipliers();
 }
 
+vector<double> IntegratorRun::getRandomState() {
+    if (settings.langevin && canTakeSettings())
+        takeSettings();
+    return device.getRandomState();
+}
+
 double IntegratorRun::computeKineticEnergy() {
     if (!settings.langevin || settings.stepSize == 0)
         return device.computeKineticEnergy();
@@ -379,7 +385,7 @@ RunState IntegratorRun::save() {
     run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
     run.lastDensity = getStepDensity();
     run.references = getReferences();
-    run.randomState = device.getRandomState();
+    run.randomState = getRandomState();
     if (!run.startsAfresh)
         device.save(run);
     return run;

@@ -52,6 +52,8 @@ public:
     double getReference(int index);
     double getMonitorValue(int index);
     std::vector<double> getMultipliers();
+    /** As of the device, with a seed that has been set since the last step. */
+    std::vector<double> getRandomState();
     /** What is reported as the kinetic energy of the Context; at constant temperature it is one of the method's state. */
     double computeKineticEnergy();
     RunDevice& getDevice() {

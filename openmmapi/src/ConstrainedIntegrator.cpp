@@ -404,7 +404,7 @@ void ConstrainedIntegrator::deserializeParameters(const SerializationNode& node)
     // States are copied about: several Contexts go on from one, and one Context goes on from one after the other (replica exchange).
     // So each keeps its seed, and no random number is drawn twice.
     saved->settings->setRandomSeed(settings->getRandomSeed());
-    const vector<double> own = run->getDevice().getRandomState();
+    const vector<double> own = run->getRandomState();
     if (!own.empty() && own.size() == state.randomState.size())
         state.randomState = {own[0], std::max(own[1], state.randomState[1])};
     resume(*saved->settings, state);
