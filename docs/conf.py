@@ -34,6 +34,8 @@ smartquotes = False  # rho' is not a quotation
 
 html_theme = "furo"
 html_title = f"OpenMM-VRATTLE {version}"
+html_static_path = ["_static"]
+html_css_files = ["pictures.css"]  # how they look in the dark theme
 
 # The pages are read on code hosts as well: formulas between dollars, links to headings by their text.
 myst_enable_extensions = ["dollarmath", "amsmath"]
