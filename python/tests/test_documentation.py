@@ -163,6 +163,13 @@ def test_every_example_is_listed() -> None:
     assert not [path.name for path in examples if f"](../{path.relative_to(ROOT).as_posix()})" not in page]
 
 
+def test_every_benchmark_is_listed() -> None:
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    scripts = [path for path in ROOT.glob("benchmarks/*.*") if path.suffix in {".py", ".sh", ".cpp"}]
+    assert len(scripts) > 10
+    assert not [path.name for path in scripts if f"](../benchmarks/{path.name})" not in page]
+
+
 @pytest.mark.filterwarnings("ignore:.*1000 steps in a row:UserWarning")
 @pytest.mark.parametrize(("row", "name"), [("a clash", "water-clash"), ("a whip", "light-heavy-chain")])
 def test_the_first_table_says_what_is_measured(row: str, name: str) -> None:
