@@ -3,8 +3,8 @@
 """Variable steps on any platform, there and back: how exactly does a run retrace its way?
 
 Eight rigid waters on the fastest platform of this machine: the integrator is turned round after some steps, retraces
-its way, and the distance from the start is printed. Beside it stands the largest energy error. With --custom it is the
-integrator that is written in Python alone.
+its way, and the distance from the start is printed: less than 1e-10 nm on Reference, and some 1e-8 in mixed precision.
+Beside it stands the largest energy error. With --custom it is the integrator that is written in Python alone.
 
     python examples/any_platform.py [--platform OpenCL] [--precision mixed] [--steps 200] [--custom]
 """

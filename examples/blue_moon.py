@@ -6,7 +6,8 @@ Two particles at a distance r attract each other, and a third one is held by a s
 the free energy along r is known: F(r) = V(r) + (3/2) n kT ln r - 2 kT ln r, with the spring's entropy and that of the
 directions of r. With r held by a constraint, the mean of its multiplier is the mean force: dF/dr = -<Lambda>. There is
 no other term, as for a distance 1/m1 + 1/m2 is constant (Carter, Ciccotti, Hynes and Kapral, Chem. Phys. Lett. 156
-(1989) 472). The scan needs one Context: each r is a new value of the constraint's parameter.
+(1989) 472). The scan needs one Context: each r is a new value of the constraint's parameter. What is found lies within
+two or three standard errors of what is known.
 
     python examples/blue_moon.py [--platform NAME] [--precision NAME]
 """

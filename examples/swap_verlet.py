@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: MIT
 """An OpenMM script whose VerletIntegrator was swapped for ours: what changes is marked with "was" and "new".
 
+It prints how far 2,000 steps went, 2 ps, since nothing unusual happens; the energies in swap_verlet.csv stay within
+1 kJ/mol, as those of VerletIntegrator do.
+
 python examples/swap_verlet.py [--platform NAME] [--precision NAME]
 """
 

@@ -78,9 +78,11 @@ def test_clash_relaxation(options: list[str], tmp_path: Path) -> None:
     output = run("clash_relaxation.py", tmp_path, options)
     assert "Use variable steps: ForcePNorm" in output
     found = re.findall(r"(\d+) force evaluations, .* largest energy error (\S+) kJ", output)
-    (fixed, fixed_error), (variable, variable_error) = [(int(number), float(error)) for number, error in found]
-    assert variable == pytest.approx(fixed, rel=0.2)
-    assert variable_error < fixed_error / 10
+    (fixed, fixed_error), *variable = [(int(number), float(error)) for number, error in found]
+    assert len(variable) == 2
+    for evaluations, error in variable:
+        assert evaluations == pytest.approx(fixed, rel=0.2)
+        assert error < fixed_error / 10
 
 
 def test_no_minimisation(tmp_path: Path) -> None:
