@@ -71,8 +71,12 @@ StepMonitor::StepMonitor(ConstraintSolver& solver) :
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms) {
+    // Where only references or powers are others, what is known of the forces is still so.
+    const bool areLike = std::equal(newTerms.begin(), newTerms.end(), terms.begin(), terms.end(),
+                                    [](const Term& a, const Term& b) { return a.isLike(b); });
     terms = newTerms;
-    forceNorms.assign(terms.size(), 0.0);
+    if (!areLike)
+        forceNorms.assign(terms.size(), 0.0);
 }
 
 bool StepMonitor::needConstraints(const vector<Term>& terms) {

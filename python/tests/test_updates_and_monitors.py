@@ -115,6 +115,49 @@ def test_weight_of_a_single_monitor(update: str) -> None:
         np.testing.assert_allclose(positions, ends[0][1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["ForcePNorm", "MaxForce"])
+@pytest.mark.parametrize("update", UPDATES)
+def test_setting_what_is_set_already_changes_nothing(update: str, kind: str) -> None:
+    """Not the norms of forces either, which are found once for each state."""
+    model = chain()
+    runs = []
+    for is_set_again in (False, True):
+        integrator = integrator_with(update, 0.001, [(kind, 1.0, 0.5), ("ConstraintForce", 1.0, 1.0)])
+        context = open_context(model.system(), integrator, "Reference", model)
+        sizes = []
+        for _ in range(20):
+            if is_set_again:
+                integrator.setConstraintTolerance(1e-12)
+            integrator.step(1)
+            sizes.append(value(integrator.getStepSize()))
+        integrator.reverse()
+        integrator.step(1)
+        runs.append((sizes, positions_of(context)))
+    assert runs[0][0] == runs[1][0]
+    assert np.array_equal(runs[0][1], runs[1][1])
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_a_monitor_of_forces_does_not_see_a_constraint_that_begins_to_move(update: str) -> None:
+    sizes = []
+    for distance in (0.3, 0.303):
+        system = openmm.System()
+        integrator = integrator_with(update, 0.001, [("ForcePNorm", 1.0, 1.0)])
+        integrator.addConstraint("x2 - x1 - distance", [0, 1], {"distance": 0.3})
+        field = openmm.CustomExternalForce("-8*y")
+        for particle in range(2):
+            system.addParticle(12.0)
+            field.addParticle(particle)
+        system.addForce(field)
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions([[0.0, 0, 0], [0.3, 0, 0]])
+        integrator.step(5)
+        integrator.setExpressionParameterValue(0, "distance", distance)
+        integrator.step(1)
+        sizes.append(value(integrator.getStepSize()))
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-9)
+
+
 def test_unit_of_a_monitor_does_not_matter() -> None:
     """Normalised term by term: the energy of a group in other units gives the same steps, its weight being the same."""
     ends = []
