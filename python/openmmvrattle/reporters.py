@@ -47,8 +47,9 @@ class StepSizeReporter:
     The columns are, as far as the integrator has them: step, time, size and density of the last step, the value of each
     monitor, energy minus the energy at the start, iterations of the constraint solver per step since the last report,
     rescues and force evaluations so far, and the largest relative error of a constraint, in the sense of
-    setConstraintTolerance(). With automatic step control the monitors are U_A and U_B of docs/automatic_method.md. An
-    integrator of OpenMM has the step size alone of what is about steps, so the two can be compared.
+    setConstraintTolerance(). With automatic step control the monitors are U_A and U_B of docs/automatic_method.md, and
+    at constant temperature there is one, U. An integrator of OpenMM has the step size alone of what is about steps, so
+    the two can be compared.
 
     A report does not disturb the run, and costs no force evaluation of the integrator. For its energy it asks OpenMM
     for the potential energy, as ``StateDataReporter`` does; two reporters that report at the same step share it, and
@@ -385,6 +386,8 @@ def _monitor_values(integrator: Any) -> dict[str, float | None]:
     if hasattr(integrator, "isAutomatic") and integrator.isAutomatic():
         # Its two monitors are its own.
         return {f"Monitor {name}": float(integrator.getMonitorValue(k)) for k, name in enumerate(("U_A", "U_B"))}
+    if not hasattr(integrator, "getNumMonitors"):  # at constant temperature there is one, U
+        return {"Monitor U": float(integrator.getMonitorValue())}
     values: dict[str, float | None] = {}
     for index in range(integrator.getNumMonitors()):
         kind = integrator.getMonitor(index)[0]

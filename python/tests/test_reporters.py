@@ -15,7 +15,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmmvrattle import CustomVariableStepRattleIntegrator, VariableStepRattleIntegrator
+from openmmvrattle import (
+    CustomVariableStepRattleIntegrator,
+    VariableStepRattleIntegrator,
+    VariableStepRattleLangevinIntegrator,
+)
 from openmmvrattle.platforms import platform_and_properties
 from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain, rigid_waters
@@ -537,3 +541,16 @@ def test_the_constraint_error_is_that_of_expressions_too() -> None:
     # With another value of a parameter.
     integrator.setExpressionParameterValue(0, "r", 0.4)
     assert reported(exact) == pytest.approx((0.25 - 0.16) / (2 * 0.5) / 0.1, rel=1e-9)
+
+
+def test_constant_temperature() -> None:
+    integrator = VariableStepRattleLangevinIntegrator(300, 1, 0.002)
+    simulation = make_simulation(integrator)
+    reporter = StepSizeReporter(None, 5)
+    simulation.reporters.append(reporter)
+    simulation.step(5)
+    row = reporter.rows[0]
+    assert row["Step Size (ps)"] == 0.002
+    assert row["Monitor U"] == integrator.getMonitorValue() > 0
+    assert row["Force Evaluations"] == integrator.getNumForceEvaluations()
+    assert row["Constraint Error"] < 1e-8
