@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import openmm
 from openmm import unit
 
 
@@ -25,14 +26,22 @@ def number(value: object, name: str, target: unit.Unit = unit.dimensionless) -> 
         return float(value)
     except TypeError:
         raise TypeError(f"{name} must be {wanted}, not {value!r}") from None
+    except OverflowError:
+        raise openmm.OpenMMException(f"{name} is an integer too large for a number") from None
 
 
-def integer(value: object, name: str) -> int:
-    """Return `value` as an int, if it is an integer of any kind."""
+_LARGEST = 2**31 - 1  # that C++ takes
+
+
+def integer(value: object, name: str, largest: int = _LARGEST) -> int:
+    """Return `value` as an int, if it is an integer of any kind that C++ can take."""
     try:
-        return operator.index(value)
+        result = operator.index(value)
     except TypeError:
         raise TypeError(f"{name} must be an integer, not {value!r}") from None
+    if not -_LARGEST - 1 <= result <= largest:
+        raise openmm.OpenMMException(f"{name} must be an integer from {-_LARGEST - 1} to {largest}, not {result}")
+    return result
 
 
 def parameter(value: object, name: str) -> float:

@@ -371,6 +371,21 @@ def test_arguments_of_a_wrong_type_are_named(call, message):
         call(VariableStepRattleIntegrator(0.002))
 
 
+@pytest.mark.parametrize(
+    "call, name",
+    [
+        (lambda i: i.step(2**31), "steps"),
+        (lambda i: i.addMonitor(-(2**40)), "kind"),
+        (lambda i: i.setUpdateMethod(2**33), "method"),
+        (lambda i: i.addConstraint("x1", [2**40]), "the index of a particle"),
+        (lambda i: i.setStepSize(10**400), "size"),
+    ],
+)
+def test_integers_that_are_too_large_are_named(call, name):
+    with pytest.raises(openmm.OpenMMException, match=f"^{name} (must be|is) an integer"):
+        call(VariableStepRattleIntegrator(0.002))
+
+
 # Contexts
 
 

@@ -370,7 +370,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             raise error("the integration force groups cannot change after the first step: make another integrator")
         if isinstance(groups, (set, frozenset)):
             groups = functools.reduce(operator.or_, (1 << integer(group, "group") for group in groups), 0)
-        self._set("forceGroups", float(_signed(integer(groups, "groups"))))
+        self._set("forceGroups", float(_signed(integer(groups, "groups", 2**32 - 1))))
         self._apply_force_groups()
 
     def _chosen_force_groups(self) -> int:
