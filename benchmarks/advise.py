@@ -10,7 +10,8 @@ control are run with as many force evaluations as the trial had, and for one num
 - the verdict is right if the best candidate gains more than 1.25 where it says variable steps, and less where it says
   fixed steps; ``little to gain`` is right between 0.8 and 3.
 
-Written to the folder ``--output``: advise.csv (one line a candidate), advise.md (tables), advise.png (gain against P).
+Written to the folder ``--output``: advise.csv (one line a candidate), advise.md (tables), advise.png (gain against P);
+with ``--page`` tables and picture go into docs/advice.md.
 
 The limits of the verdicts were set with these systems in view. Ten others, of benchmarks/automatic_unseen.py, are run
 with --unseen in their place.
@@ -124,8 +125,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not options.best_only:
         _draw(rows, options.output / "advise.png")
     if options.page:
-        place = "unseen" if options.unseen else "verdicts"
-        pages.write(pages.DOCS / "advice.md", place, [pages.provenance(), "", *_verdicts(rows)])
+        page, provenance = pages.DOCS / "advice.md", pages.provenance()
+        pages.write(page, "unseen" if options.unseen else "verdicts", [provenance, "", *_verdicts(rows)])
+        if not options.best_only and not options.unseen:
+            picture = "![Gain against P for all candidates](images/advise.png)"
+            pages.write(page, "candidates", [provenance, "", *_statistics(rows), "", picture])
+            _draw(rows, pages.DOCS / "images" / "advise.png")
     print(report)
     seconds = time.perf_counter() - started
     print(f"\n{seconds:.0f} s, OpenMM {openmm.Platform.getOpenMMVersion()}, {platform.machine()}.")
@@ -232,15 +237,16 @@ def _statistics(rows: Sequence[Row]) -> list[str]:
     if len(known) < 10:
         return []
     p, gain = (np.log([getattr(row, name) for row in known]) for name in ("predictor", "gain"))
+    systems = len({row.system for row in known})
     lines = [
-        f"{len(known)} candidates that came to the end, in trials that resolve the motion: the correlation of log P "
-        f"and log gain is {np.corrcoef(p, gain)[0, 1]:.2f}, and the gain is {np.exp(np.median(gain - p)):.2f} P in the "
-        "median.",
+        f"{len(known)} candidates on {systems} systems that came to the end, in trials that resolve the motion: the",
+        f"correlation of log P and log gain is {np.corrcoef(p, gain)[0, 1]:.2f}, and the gain is "
+        f"{np.exp(np.median(gain - p)):.2f} P in the median.",
         "",
         "| P | candidates | failed | gain above 1.25 | median gain |",
         "|---|---|---|---|---|",
     ]
-    for low, high in ((0.0, 1.0), (1.0, 2.2), (2.2, 5.0), (5.0, math.inf)):
+    for low, high in ((0.0, 1.0), (1.0, 2.2), (2.2, 3.3), (3.3, 5.0), (5.0, math.inf)):
         own = [row for row in rows if row.resolved and low <= row.predictor < high]
         gains = [row.gain for row in own if math.isfinite(row.gain)]
         if own:

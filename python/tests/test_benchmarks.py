@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="needs the folder be
 
 def run_script(folder, *arguments):
     command = [sys.executable, str(SCRIPT), "--output", str(folder), *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     return result.stdout
 
@@ -97,7 +97,7 @@ def test_report_has_tables_and_says_which_claims_were_measured(quick):
 )
 def test_wrong_usage_is_refused(tmp_path, arguments):
     command = [sys.executable, str(SCRIPT), "--output", str(tmp_path), *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert result.returncode == 2
     assert "error: " in result.stderr
 

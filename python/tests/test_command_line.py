@@ -34,7 +34,7 @@ from run_support import needs_opencl, solvated
 
 def run_command(*arguments: str, **options):
     return subprocess.run(
-        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=300, **options
+        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=600, **options
     )
 
 

@@ -392,7 +392,7 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "rod.py"
 
 def run_benchmark(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(BENCHMARK), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
 
 
 @pytest.mark.skipif(not BENCHMARK.exists(), reason="needs the folder benchmarks")

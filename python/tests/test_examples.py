@@ -28,7 +28,7 @@ def run(name: str, folder: Path, options: list[str] | None = None) -> str:
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert result.returncode == 0, result.stderr
     # OpenMM warns of drivers that it was not tried with, such as OpenCL on a processor.
@@ -112,7 +112,7 @@ def test_those_with_files_of_their_own_run_on_a_platform_by_name(name: str, tmp_
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
 def test_every_example_takes_a_platform(path: Path) -> None:
-    result = subprocess.run([sys.executable, str(path), "--help"], capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, str(path), "--help"], capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     assert "--platform" in result.stdout and "--precision" in result.stdout
 

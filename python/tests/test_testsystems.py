@@ -258,7 +258,7 @@ README = Path(__file__).parents[2] / "README.md"
 
 @pytest.mark.skipif(not EXAMPLE.exists(), reason="needs the folder examples")
 def test_quick_start_keeps_the_energy():
-    result = subprocess.run([sys.executable, str(EXAMPLE)], capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, str(EXAMPLE)], capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     energies = [float(line.split("energy")[1].split()[0]) for line in result.stdout.splitlines()]
     assert len(energies) == 20
