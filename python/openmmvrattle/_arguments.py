@@ -55,7 +55,8 @@ def array(value: Any, name: str, target: unit.Unit) -> np.ndarray:
     """Return `value`, numbers or Quantities in any arrangement, as an array in the unit `target`."""
     if unit.is_quantity(value):
         if not value.unit.is_compatible(target):
-            raise TypeError(f"{name} must be in {target.get_name()}s, not in {value.unit.get_name()}")
+            wanted = "plain numbers" if target is unit.dimensionless else f"in {target.get_name()}s"
+            raise TypeError(f"{name} must be {wanted}, not in {value.unit.get_name()}")
         value = value.value_in_unit(target)
     if isinstance(value, np.ndarray):
         return np.array(value, dtype=float)

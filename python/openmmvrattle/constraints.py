@@ -27,7 +27,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from ._arguments import array, number
+from ._arguments import array, integer, number
 
 if TYPE_CHECKING:
     from .integrators import VariableStepRattleIntegrator
@@ -207,7 +207,11 @@ def fix_center_of_mass(
     particles together pull at their centre.
     """
     chosen = range(system.getNumParticles()) if particles is None else particles
-    masses = {int(i): system.getParticleMass(int(i)).value_in_unit(unit.dalton) for i in chosen}
+    indices = [integer(i, "the index of a particle") for i in chosen]
+    for index in indices:
+        if not 0 <= index < system.getNumParticles():
+            raise ValueError(f"there is no particle {index}; the System has {system.getNumParticles()}")
+    masses = {index: system.getParticleMass(index).value_in_unit(unit.dalton) for index in indices}
     masses = {i: mass for i, mass in masses.items() if mass > 0}
     if not masses:
         raise ValueError("none of the particles has mass, so they have no centre of mass")
@@ -245,6 +249,9 @@ def _positive(value: float | unit.Quantity, name: str) -> float:
 
 
 def _vector(value: Sequence[float] | unit.Quantity, target: unit.Unit, name: str) -> np.ndarray:
+    numbers = value._value if unit.is_quantity(value) else value
+    if isinstance(numbers, (str, bytes)) or not isinstance(numbers, Iterable):
+        raise TypeError(f"{name} must have three components, not {value!r}")
     vector = array(value, name, target)
     if vector.shape != (3,):
         raise ValueError(f"{name} must have three components, not {len(vector)}")
@@ -257,7 +264,8 @@ def _point(value: Sequence[float] | unit.Quantity, name: str) -> dict[str, float
 
 def _direction(value: Sequence[float], name: str) -> np.ndarray:
     vector = _vector(value, unit.dimensionless, name)
-    length = float(np.linalg.norm(vector))
-    if not length > 0:
-        raise ValueError(f"the {name} must not be zero")
-    return vector / length
+    largest = float(np.max(np.abs(vector)))
+    if not 0 < largest < math.inf:
+        raise ValueError(f"the {name} must be finite and not zero, not {vector.tolist()}")
+    vector = vector / largest  # whose square neither overflows nor vanishes
+    return vector / np.linalg.norm(vector)

@@ -373,15 +373,40 @@ def test_pendulum_on_a_point_is_that_on_a_heavy_particle() -> None:
         (lambda i: constraints.fix_distance_to_point(i, 0, (0, 0), 1), ValueError, "three components"),
         (lambda i: constraints.fix_distance_to_point(i, 0, (0, 0, 0), -1), ValueError, "must be positive"),
         (lambda i: constraints.fix_to_sphere(i, 0, (0, 0, 0), 1 * unit.second), TypeError, "nanometers"),
-        (lambda i: constraints.fix_to_plane(i, 0, (0, 0, 0), (0, 0, 0)), ValueError, "normal must not be zero"),
+        (
+            lambda i: constraints.fix_to_plane(i, 0, (0, 0, 0), (0, 0, 0)),
+            ValueError,
+            "normal must be finite and not zero",
+        ),
         (lambda i: constraints.fix_to_plane(i, 0, (0, 0, 0) * unit.second, (0, 0, 1)), TypeError, "point must be"),
-        (lambda i: constraints.fix_to_line(i, 0, (0, 0, 0), (0, 0, 0)), ValueError, "direction must not be zero"),
+        (
+            lambda i: constraints.fix_to_line(i, 0, (0, 0, 0), (0, 0, 0)),
+            ValueError,
+            "direction must be finite and not zero",
+        ),
         (lambda i: constraints.fix_distance_difference(i, (0, 1), (1, 0), 0), ValueError, "two different pairs"),
         (lambda i: constraints.fix_distance_difference(i, (0, 0), (1, 2), 0), ValueError, "two different pairs"),
         (
             lambda i: constraints.fix_center_of_mass(i, make_system([0.0, 1.0]), (0, 0, 0), [0]),
             ValueError,
             "none of the particles has mass",
+        ),
+        (
+            lambda i: constraints.fix_center_of_mass(i, make_system([1.0, 1.0]), (0, 0, 0), [0, 0.5]),
+            TypeError,
+            "index of a particle must be an integer, not 0.5",
+        ),
+        (
+            lambda i: constraints.fix_center_of_mass(i, make_system([1.0, 1.0]), (0, 0, 0), [0, 2]),
+            ValueError,
+            "there is no particle 2; the System has 2",
+        ),
+        (lambda i: constraints.fix_distance_to_point(i, 0, 5, 1), TypeError, "point must have three components, not 5"),
+        (lambda i: constraints.fix_to_plane(i, 0, (0, 0, 0), (0, 0, math.inf)), ValueError, "must be finite"),
+        (
+            lambda i: constraints.fix_to_plane(i, 0, (0, 0, 0), (0, 0, 1) * unit.nanometer),
+            TypeError,
+            "normal must be plain numbers, not in nanometer",
         ),
     ],
 )
@@ -390,3 +415,11 @@ def test_wrong_values(add: Callable[[Any], Any], error: type[Exception], message
     with pytest.raises(error, match=message):
         add(integrator)
     assert integrator.getNumExpressionConstraints() == 0
+
+
+@pytest.mark.parametrize("length", [1e-200, 1e200])
+def test_a_normal_of_any_length(length: float) -> None:
+    integrator = VariableStepRattleIntegrator(0.001)
+    constraints.fix_to_plane(integrator, 0, (0, 0, 0), (0, 3 * length, 4 * length))
+    parameters = integrator.getExpressionConstraintParameters(0)[2]
+    assert [parameters[name] for name in ("nx", "ny", "nz")] == pytest.approx([0, 0.6, 0.8])
