@@ -766,11 +766,13 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         """Take steps; if one cannot be completed, the Context is in the state before that one."""
         try:
             openmm.CustomIntegrator.step(self, steps)
-        except BaseException:
+        except BaseException as failure:
             if self._get("moved"):
                 self._undo(context, self._kept())
             elif self._run.keeps_variables:  # They are those after the last step that was completed, and so are these.
                 self._put_back(context, "end", "velocity")
+            if isinstance(failure, openmm.OpenMMException) and "NaN" in str(failure):  # of platforms that look for it
+                raise error(self._explain_not_finite(context)) from failure
             raise
         if self._get("lost"):
             skipped = int(self._get("skipped"))
@@ -783,11 +785,14 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             return
         self._undo(context, self._kept())
         context.setStepCount(context.getStepCount() - 1)
-        positions = positions_of(context)
-        raise error(
+        raise error(self._explain_not_finite(context))
+
+    def _explain_not_finite(self, context: openmm.Context) -> str:
+        """Of a step that has been undone."""
+        return (
             "a step could not be taken, as forces, monitors or the constraint solver gave numbers that are not finite; "
             "the Context is in the state before this step: "
-            + (redundant_constraints(context.getSystem(), positions) or "take a smaller nominal step size")
+            + (redundant_constraints(context.getSystem(), positions_of(context)) or "take a smaller nominal step size")
         )
 
     def _kept(self) -> dict[str, float]:

@@ -31,7 +31,7 @@ MONITOR_KINDS = (
 """The kinds of monitor by their numbers, the same as of VariableStepRattleIntegrator."""
 
 
-INSTEAD = "VariableStepRattleIntegrator, which runs on the platforms Reference and CPU"
+INSTEAD = "VariableStepRattleIntegrator, which runs on every platform"
 REFUSED_MONITORS = {
     "ConstraintMultipliers": "needs the constraints' multipliers, which OpenMM does not tell: use ConstraintForce",
     "MultiplierPNorm": "needs the constraints' multipliers, which OpenMM does not tell: use ConstraintForce",
