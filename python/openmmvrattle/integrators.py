@@ -243,7 +243,7 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         As with the System's constraints, positions that do not satisfy it are moved to the nearest ones that do, at
         the first step. OpenMM itself knows nothing of it: Context.applyConstraints() and
         applyVelocityConstraints() leave it alone, and a CompoundIntegrator's other integrators do not keep it. It
-        works on the platforms Reference and CPU.
+        works on every platform.
 
         A constraint that is added after the Context was created takes effect with Context.reinitialize(); until
         then steps raise an exception.
