@@ -374,7 +374,7 @@ inline void testRefusedCheckpoints() {
     ASSERT(start != std::string::npos);
     std::string newer = checkpoint, damaged = checkpoint;
     newer[start + 8] = 9;
-    assertThrows("version 9 of its format and this plugin reads version 4",
+    assertThrows("version 9 of its format and this plugin reads version 5",
                  [&] { loadCheckpoint(run.context, newer); });
     damaged[damaged.size() - 100] ^= 1;
     assertThrows("damaged", [&] { loadCheckpoint(run.context, damaged); });

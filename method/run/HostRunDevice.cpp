@@ -217,7 +217,10 @@ template <class Method> void HostRunDevice<Method>::changeState() {
 }
 
 template <class Method> void HostRunDevice<Method>::changeVelocities() {
-    if (ahead == nullptr && method.changeFrame(vectors->getVelocities()))
+    const bool isFrame = method.changeFrame(knownVelocities(), vectors->getVelocities());
+    if (isFrame && ahead != nullptr) // somebody has looked between the start and the step
+        ahead->velocities = vectors->getVelocities();
+    if (isFrame)
         return;
     method.changeVelocities(vectors->getVelocities());
     ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});

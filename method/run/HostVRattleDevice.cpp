@@ -92,6 +92,14 @@ double HostVRattleDevice::getNegligibleValue() {
     return vrattle.getAutomaticControl().getNegligibleValue();
 }
 
+double HostVRattleDevice::getReferenceTemperature() {
+    return vrattle.getAutomaticControl().getMemory().temperature;
+}
+
+void HostVRattleDevice::setReferenceTemperature(double temperature) {
+    vrattle.setReferenceTemperature(temperature);
+}
+
 long long HostVRattleDevice::getNumShortSteps() {
     return (long long) vrattle.getAutomaticControl().getMemory().mostShortSteps;
 }

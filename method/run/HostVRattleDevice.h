@@ -23,6 +23,8 @@ public:
     std::vector<double> getMonitorValues() override;
     long long getNumRescues() override;
     double getNegligibleValue() override;
+    double getReferenceTemperature() override;
+    void setReferenceTemperature(double temperature) override;
     long long getNumShortSteps() override;
     bool canResume(const RunState& run, const IntegratorSettings& saved) override;
 

@@ -385,6 +385,7 @@ RunState IntegratorRun::save() {
     run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
     run.lastDensity = getStepDensity();
     run.references = getReferences();
+    run.referenceTemperature = device.getReferenceTemperature();
     run.randomState = getRandomState();
     if (!run.startsAfresh)
         device.save(run);
@@ -409,8 +410,10 @@ void IntegratorRun::resume(const RunState& run) {
     if (!canTakeSettings())
         return;
     takeSettings();
-    if ((int) run.references.size() == settings.getNumReferences())
+    if ((int) run.references.size() == settings.getNumReferences()) {
         device.setReferences(run.references);
+        device.setReferenceTemperature(run.referenceTemperature);
+    }
     if (!run.randomState.empty())
         device.setRandomState(run.randomState);
     if (run.system == system && !run.startsAfresh && device.canResume(run, settings))

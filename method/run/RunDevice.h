@@ -183,6 +183,12 @@ public:
     virtual double getNegligibleValue() {
         return 0;
     }
+    /** 2K/f (kJ/mol) where its references were found, which belongs to these; 0 if they were not. */
+    virtual double getReferenceTemperature() {
+        return 0;
+    }
+    virtual void setReferenceTemperature(double) {
+    }
     /** The most steps in a row that were shorter than a tenth of the nominal one. */
     virtual long long getNumShortSteps() {
         return 0;

@@ -104,6 +104,7 @@ void RunState::write(std::ostream& stream) const {
     writeValue(stream, lastStepSize);
     writeValue(stream, lastDensity);
     writeArray(stream, references);
+    writeValue(stream, referenceTemperature);
     writeArray(stream, randomState);
     writeValue(stream, startsAfresh);
     if (startsAfresh)
@@ -132,6 +133,7 @@ void RunState::read(std::istream& stream) {
     readValue(stream, lastStepSize);
     readValue(stream, lastDensity);
     readArray(stream, references);
+    readValue(stream, referenceTemperature);
     readArray(stream, randomState);
     readValue(stream, startsAfresh);
     if (startsAfresh)
@@ -159,6 +161,7 @@ void RunState::write(SerializationNode& node) const {
     node.setLongProperty("parameters", (long long) parameters).setBoolProperty("areForcesOutdated", areForcesOutdated);
     node.setDoubleProperty("lastStepSize", lastStepSize).setDoubleProperty("lastDensity", lastDensity);
     writeArray(node, "References", references);
+    node.setDoubleProperty("referenceTemperature", referenceTemperature);
     if (!randomState.empty())
         writeArray(node, "RandomState", randomState);
     node.setBoolProperty("startsAfresh", startsAfresh);
@@ -186,6 +189,7 @@ void RunState::read(const SerializationNode& node) {
     lastStepSize = node.getDoubleProperty("lastStepSize");
     lastDensity = node.getDoubleProperty("lastDensity");
     readArray(node, "References", references);
+    referenceTemperature = node.getDoubleProperty("referenceTemperature", 0.0);
     for (const SerializationNode& child : node.getChildren())
         if (child.getName() == "RandomState")
             readArray(node, "RandomState", randomState);

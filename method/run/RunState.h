@@ -66,6 +66,7 @@ struct RunState {
     double lastStepSize = 0;           // ps; 0 before the first step
     double lastDensity = 1;            // rho of the last step
     std::vector<double> references;    // U_k,ref in force, 0 if not known
+    double referenceTemperature = 0;   // RunDevice::getReferenceTemperature()
     std::vector<double> randomState;   // RunDevice::getRandomState()
     bool startsAfresh = true;          // no step since the user changed the state: nothing of what follows is there
 

@@ -95,6 +95,10 @@ public:
     const Memory& getMemory() const {
         return memory;
     }
+    /** 2K/f where the references were found that somebody has set. */
+    void setReferenceTemperature(double kT) {
+        memory.temperature = kT;
+    }
     void setMemory(const Memory& newMemory) {
         memory = newMemory;
     }

@@ -20,6 +20,9 @@ public:
     }
     std::vector<double> getReferences() const override;
     void setReferences(const std::vector<double>& references) override;
+    void setReferenceTemperature(double kT) {
+        control.setReferenceTemperature(kT);
+    }
     bool setSettings(const StepSettings& settings, bool isInForce) override;
     void changeSettings() override;
     void getMemory(StepMemory& memory) const override;

@@ -261,9 +261,10 @@ void LangevinDynamics::resume(const Vectors& positions, const Vectors& velocitie
     settle();
 }
 
-bool LangevinDynamics::changeFrame(const Vectors& velocities) {
+bool LangevinDynamics::changeFrame(const Vectors& before, const Vectors& velocities) {
+    const bool areOwn = &before == &v;
     Vec3 shift;
-    if (!solver.findFrameShift(v, velocities, shift))
+    if (!solver.findFrameShift(before, velocities, shift))
         return false;
     const vector<int>& particles = solver.getMovingParticles();
     const double count = (double) particles.size(), square = shift.dot(shift);
@@ -271,7 +272,7 @@ bool LangevinDynamics::changeFrame(const Vectors& velocities) {
         solver.sum((int) particles.size(), [&](int p) { return v[particles[p]].dot(v[particles[p]]); });
     solver.share((int) particles.size(), [&](int first, int end) {
         for (int p = first; p < end; p++)
-            v[particles[p]] = velocities[particles[p]];
+            v[particles[p]] = areOwn ? velocities[particles[p]] : v[particles[p]] + shift;
     });
     // What is removed in each step is less than U is known to.
     if (square * count > SMALL_SHIFT * SMALL_SHIFT * squares)

@@ -90,7 +90,7 @@ public:
     }
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
-    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
+    bool changeFrame(const std::vector<OpenMM::Vec3>& before, const std::vector<OpenMM::Vec3>& velocities);
     void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
     void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 

@@ -178,16 +178,18 @@ void VRattleDynamics::changeState(const vector<Vec3>& positions, const vector<Ve
         formHalfStepVelocities();
 }
 
-bool VRattleDynamics::changeFrame(const vector<Vec3>& velocities) {
+bool VRattleDynamics::changeFrame(const vector<Vec3>& before, const vector<Vec3>& velocities) {
     const vector<int>& movingParticles = constraints.getMovingParticles();
     const int count = (int) movingParticles.size();
+    const bool areOwn = &before == &now.v;
     Vec3 shift;
-    if (!constraints.findFrameShift(now.v, velocities, shift))
+    if (!constraints.findFrameShift(before, velocities, shift))
         return false;
     constraints.share(count, [&](int first, int end) {
         for (int p = first; p < end; p++) {
-            now.v[movingParticles[p]] = velocities[movingParticles[p]];
-            now.w[movingParticles[p]] += shift;
+            const int i = movingParticles[p];
+            now.v[i] = areOwn ? velocities[i] : now.v[i] + shift;
+            now.w[i] += shift;
         }
     });
     control->change(StepControl::Frame, 0.0);

@@ -138,6 +138,10 @@ public:
     void setReferences(const std::vector<double>& references) {
         control->setReferences(references);
     }
+    /** The 2K/f at which those of automatic step control were found. */
+    void setReferenceTemperature(double kT) {
+        automatic.setReferenceTemperature(kT);
+    }
     /** Go on from a changed state, with the density scaled with u, so that it stays free of oscillation. */
     void changeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                      const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
@@ -146,9 +150,10 @@ public:
      * centre of mass leaves them in each step. Constraints between moving particles and their multipliers know nothing of it, so
      * that it costs no more than to look.
      *
+     * @param before    what the velocities were: getVelocities(), or those of somebody whose state has been projected onto these
      * @return whether that is what they are; if not, nothing has been changed
      */
-    bool changeFrame(const std::vector<OpenMM::Vec3>& velocities);
+    bool changeFrame(const std::vector<OpenMM::Vec3>& before, const std::vector<OpenMM::Vec3>& velocities);
     /** Go on with changed velocities at the same positions; as changeState(). */
     void changeVelocities(const std::vector<OpenMM::Vec3>& velocities);
     /**

@@ -142,9 +142,9 @@ void testChangedFrame() {
             v += shift;
         vector<Vec3> others = velocities;
         others.back() += Vec3(0, 1e-9, 0);
-        ASSERT(!moving.changeFrame(others));
+        ASSERT(!moving.changeFrame(moving.getVelocities(), others));
         ASSERT_EQUAL_VEC(resting.getVelocities()[0], moving.getVelocities()[0], 0.0);
-        ASSERT(moving.changeFrame(velocities));
+        ASSERT(moving.changeFrame(moving.getVelocities(), velocities));
         if (kind == StepMonitor::VectorField) { // which sees the frame
             double square = 0;
             for (size_t i = 0; i < velocities.size(); i++)
@@ -190,7 +190,7 @@ void testFailedSteps() {
                         for (size_t i = 0; i < velocities.size(); i++)
                             velocities[i] += next == 1 ? Vec3(0.3, -2, 0.7) : Vec3(0, 0.01 * (double) i, 0);
                         if (next == 1)
-                            ASSERT(dynamics->changeFrame(velocities));
+                            ASSERT(dynamics->changeFrame(dynamics->getVelocities(), velocities));
                         if (next == 2)
                             dynamics->changeVelocities(velocities);
                         if (next == 3)

@@ -893,6 +893,49 @@ def test_a_checkpoint_in_the_first_steps() -> None:
     assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == references
 
 
+@pytest.mark.parametrize("form", ["none", "checkpoint", "state", "reinitialize"])
+def test_much_faster_velocities_before_a_checkpoint(form: str) -> None:
+    """The temperature at which references were found is saved with them, also where the next step starts afresh."""
+    model = waters()
+    integrator = automatic(0.001, 10)
+    context = open_context(model.system(), integrator, "Reference", model)
+    integrator.step(20)
+    reference = integrator.getReferenceMonitorValue(0)
+    assert reference > 0
+    context.setVelocities(3 * velocities_of(context))
+    if form == "checkpoint":
+        checkpoint = context.createCheckpoint()
+        integrator = automatic(0.001, 10)
+        context = open_context(model.system(), integrator, "Reference")
+        context.loadCheckpoint(checkpoint)
+    elif form == "state":
+        state = context.getState(positions=True, velocities=True, integratorParameters=True)
+        integrator = automatic(0.001, 10)
+        context = open_context(model.system(), integrator, "Reference")
+        context.setState(XmlSerializer.deserialize(XmlSerializer.serialize(state)))
+    elif form == "reinitialize":
+        context.reinitialize(preserveState=True)
+    assert integrator.getReferenceMonitorValue(0) == reference
+    integrator.step(1)
+    assert integrator.getReferenceMonitorValue(0) == 0  # it is found anew
+
+
+def test_references_stay_where_somebody_looks_at_a_start() -> None:
+    """What is taken from the motion of the centre between that and the step is no thermostat."""
+    model = waters()
+    system = model.system()
+    system.addForce(openmm.CMMotionRemover(1))
+    integrator = automatic(0.001, 10)
+    context = open_context(system, integrator, "Reference", model)
+    integrator.step(60)
+    references = [integrator.getReferenceMonitorValue(k) for k in range(2)]
+    context.setVelocities(velocities_of(context) + np.array([0.05, 0, 0]))
+    integrator.getMultipliers()
+    integrator.step(60)
+    assert [integrator.getReferenceMonitorValue(k) for k in range(2)] == references
+    assert np.abs(np.array(model.masses) @ velocities_of(context)).max() < 1e-10
+
+
 def test_velocities_set_after_a_start_at_rest() -> None:
     """References of a frozen state do not slow down what is warm."""
     test = alanine_dipeptide()

@@ -382,8 +382,8 @@ def test_a_checkpoint_of_something_else_is_refused(water: TestSystem, molecule: 
         open_test_context(molecule, make_integrator()).loadCheckpoint(checkpoint)
     # A number after the mark says which version of the format it is.
     mark = checkpoint.index(b"VRATTLE\n") + 8
-    newer = checkpoint[:mark] + (5).to_bytes(4, sys.byteorder) + checkpoint[mark + 4 :]
-    with pytest.raises(openmm.OpenMMException, match="version 5 of its format and this plugin reads version 4"):
+    newer = checkpoint[:mark] + (6).to_bytes(4, sys.byteorder) + checkpoint[mark + 4 :]
+    with pytest.raises(openmm.OpenMMException, match="version 6 of its format and this plugin reads version 5"):
         context.loadCheckpoint(newer)
     for end in (mark - 3, mark + 2, mark + 10, mark + 30, len(checkpoint) - 1):
         with pytest.raises(openmm.OpenMMException, match="OpenMM-VRATTLE: this checkpoint"):

@@ -87,6 +87,11 @@ vector<double> CommonVRattleDevice::getReferences() {
     return others != nullptr ? referencesOf(*others) : HostVRattleDevice::getReferences();
 }
 
+double CommonVRattleDevice::getReferenceTemperature() {
+    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
+    return others != nullptr ? others->automatic.temperature : HostVRattleDevice::getReferenceTemperature();
+}
+
 long long CommonVRattleDevice::getNumShortSteps() {
     const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
     return others != nullptr ? (long long) others->automatic.mostShortSteps : HostVRattleDevice::getNumShortSteps();

@@ -18,6 +18,7 @@ public:
     void beginTrial(double stepSize, bool isBackwards) override;
     std::vector<double> getMonitorValues() override;
     long long getNumRescues() override;
+    double getReferenceTemperature() override;
     long long getNumShortSteps() override;
 
 protected:
