@@ -226,8 +226,18 @@ void IntegratorRun::step(int count) {
 void IntegratorRun::stepTo(double time) {
     if (time > device.getTime())
         takeSteps([&] {
-            while (time > device.getTime())
+            for (double now = device.getTime(); time > now;) {
                 askForStep(time);
+                const double last = now;
+                now = device.getTime();
+                if (!(now > last)) {
+                    std::stringstream message;
+                    message << getName() << ": stepTo() makes no way at t = " << now
+                            << " ps, which is so large that a step is lost in its rounding; set the time back with "
+                               "setTime() of the Context";
+                    throw OpenMMException(message.str());
+                }
+            }
         });
 }
 

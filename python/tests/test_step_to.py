@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import openmm
 import pytest
 from dense_reference import UPDATES, Array, chain, double_pendulum, open_context, positions_of, time_of, value
 from openmm import unit
@@ -165,3 +166,17 @@ def test_energy_error_of_interrupted_runs() -> None:
     print(f"energy error alone {errors[0]:.1e}, interrupted {errors[1]:.1e} kJ/mol of {abs(start):.0f}")
     # Interrupted runs are not exactly reversible, and so may drift; over 80 frames not beyond the same order.
     assert errors[1] < 10 * errors[0]
+
+
+def test_a_time_beyond_the_digits_of_a_step() -> None:
+    """At 1e15 ps the next number is 0.125 ps away: no step would ever get there."""
+    model = chain()
+    integrator = make_integrator(0.001)
+    context = open_context(model.system(), integrator, "Reference", model)
+    context.setTime(1e15)
+    with pytest.raises(openmm.OpenMMException, match="makes no way at t = 1e"):
+        integrator.stepTo(1e15 + 16)
+    integrator.stepTo(1e15)
+    context.setTime(0)
+    integrator.stepTo(0.01)
+    assert time_of(context) == 0.01
