@@ -83,6 +83,10 @@ public:
     const ExpressionParameters& getParameters() const {
         return theta;
     }
+    /** Whether the parameters are the same in the last step and the next. */
+    bool areParametersAtRest() const {
+        return target == theta.values && !theta.isMoving;
+    }
     void adoptParameters();
     void setReferences(const std::vector<double>& references);
     std::vector<double> getReferences() const {

@@ -148,7 +148,7 @@ def _uses() -> dict[str, _Use]:
         return openmmvrattle.VariableStepRattleIntegrator(0.001, **settings)
 
     def with_expression() -> Any:
-        integrator = variable()
+        integrator = variable(automatic=True)
         integrator.addConstraint("z1", [2])
         return integrator
 

@@ -7,7 +7,7 @@ using namespace OpenMMVRattle;
 using std::vector;
 
 bool CommonLangevinDevice::canGoOnDevice() {
-    return expressions.empty() && langevin.isCalm();
+    return langevin.areParametersAtRest() && langevin.isCalm();
 }
 
 DeviceSteps::Settings CommonLangevinDevice::makeDeviceSettings() {

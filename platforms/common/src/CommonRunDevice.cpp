@@ -119,8 +119,7 @@ template <class Host> void CommonRunDevice<Host>::ensureForces() {
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
 template <class Host> bool CommonRunDevice<Host>::canStepOnDevice() {
-    return steps != nullptr && !reach.isUnknown && ahead == nullptr && (expressions.empty() || takesExpressions()) &&
-           canGoOnDevice();
+    return steps != nullptr && !reach.isUnknown && ahead == nullptr && canGoOnDevice();
 }
 
 // Where parameters of expressions are others now molecules may be so too, that were identical; then OpenMM puts them into another order.

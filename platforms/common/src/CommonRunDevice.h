@@ -70,10 +70,6 @@ protected:
     bool differ(const Vectors& a, const Vectors& b) override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
-    /** Whether the kernels of the steps in force know constraints that are given as expressions. */
-    virtual bool takesExpressions() {
-        return false;
-    }
     /** The settings in force, for the GPU. */
     virtual DeviceSteps::Settings makeDeviceSettings() = 0;
     /** What there is of the host's state beside positions, velocities and forces. */

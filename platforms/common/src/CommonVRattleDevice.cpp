@@ -29,11 +29,6 @@ bool CommonVRattleDevice::canGoOnDevice() {
             std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
 }
 
-// Those of automatic step control do not.
-bool CommonVRattleDevice::takesExpressions() {
-    return !settings.isAutomatic;
-}
-
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
     DeviceSteps::Settings to = {
         settings.stepSize,  StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),

@@ -262,10 +262,13 @@ void DeviceSteps::compile(StepProgram::Update update) {
         setArguments(created);
         if (!large.isEmpty() && numFused == 0)
             setLargeArguments(created);
-        if (expressions)
+        if (expressions) {
             created.expressions = expressions->create(
                 text, program->hasHalfSums(),
                 {settingsArray, partials, failure, oldPositions, oldVelocities, numGroups, numPartials});
+            addLastState(created.expressions.finish);
+            addNoiseState(created.expressions.advance);
+        }
         found = compiled.insert({key, created}).first;
     }
     kernels = found->second;
@@ -348,6 +351,15 @@ void DeviceSteps::addLastState(ComputeKernel& kernel) {
     kernel->addArg(lastVelocities);
 }
 
+// For kernels that do not have the settings already.
+void DeviceSteps::addNoiseState(ComputeKernel& kernel) {
+    if (!isLangevin())
+        return;
+    kernel->addArg(settingsArray);
+    kernel->addArg(noise);
+    kernel->addArg(context.getAtomIndexArray());
+}
+
 // The same for kernels/large.cc.
 void DeviceSteps::setLargeArguments(Kernels& created) {
     OpenMM::ArrayInterface& corrections = correctionsOf(context);
@@ -382,11 +394,7 @@ void DeviceSteps::setLargeArguments(Kernels& created) {
     created.advanceLarge->addArg(oldPositions);
     created.advanceLarge->addArg(oldVelocities);
     addState(created.advanceLarge);
-    if (isLangevin()) {
-        created.advanceLarge->addArg(settingsArray);
-        created.advanceLarge->addArg(noise);
-        created.advanceLarge->addArg(context.getAtomIndexArray());
-    }
+    addNoiseState(created.advanceLarge);
 }
 
 // The type must be that of the kernel's parameter.
@@ -452,8 +460,7 @@ void DeviceSteps::launchFinish(int step, double kick, Control::Change change, bo
     kernels.finish->setArg(4, control[half]);
     launch(kernels.finish, 18);
     if (expressions) {
-        expressions->launchFinish(kernels.expressions, step, kick, change != Control::NothingChanged, isStored,
-                                  control[half]);
+        expressions->launchFinish(kernels.expressions, step, kick, change, isStored, control[half]);
         numLaunches++;
     }
     if (!kernels.finishLarge)

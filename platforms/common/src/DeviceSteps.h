@@ -148,6 +148,7 @@ private:
     void setWide(OpenMM::ComputeKernel& kernel, int index, double value);
     void addLargeTables(OpenMM::ComputeKernel& kernel);
     void addLastState(OpenMM::ComputeKernel& kernel);
+    void addNoiseState(OpenMM::ComputeKernel& kernel);
     void launch(OpenMM::ComputeKernel& kernel, int numOwnArguments);
     int nextStamp();
     int getMaxStages() const;

@@ -47,7 +47,9 @@ enum Header {
     RowStart,
     RowSlot,
     RowColumn,
-    HEADER_SIZE = 28
+    NumClusters,
+    ClusterStart, // by places; behind the last of them are particles that do not move
+    HEADER_SIZE
 };
 
 const int DISTANCE = 0;
@@ -118,14 +120,17 @@ ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vecto
         if (roots.count(rootOf(row)) > 0)
             clusters[rootOf(row)].push_back(row);
     vector<Row> open;
+    vector<int> firstRows; // of each cluster
     for (const auto& cluster : clusters) {
         if (!open.empty() && open.size() + cluster.second.size() > (size_t) PART_SIZE) {
-            addPart(open, masses);
+            addPart(open, firstRows, masses);
             open.clear();
+            firstRows.clear();
         }
+        firstRows.push_back((int) open.size());
         open.insert(open.end(), cluster.second.begin(), cluster.second.end());
     }
-    addPart(open, masses);
+    addPart(open, firstRows, masses);
 }
 
 ExpressionClusters::Kind ExpressionClusters::nameKind(const ExpressionConstraint& constraint) {
@@ -158,14 +163,25 @@ void ExpressionClusters::writeParameters(int expression, const std::map<string, 
         all[place++] = value.second;
 }
 
-void ExpressionClusters::addPart(const vector<Row>& rows, const vector<double>& masses) {
+void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& firstRows, const vector<double>& masses) {
     const int numRows = (int) rows.size();
-    vector<int> atoms;
+    // The particles of one cluster after those of another; what does not move may be in several, and comes last.
+    vector<int> atoms, clusterStart;
     std::map<int, int> placeOf;
-    for (const Row& row : rows)
-        for (int i : row.particles)
-            if (placeOf.emplace(i, (int) atoms.size()).second)
-                atoms.push_back(i);
+    for (const bool isMoving : {true, false}) {
+        auto nextCluster = firstRows.begin();
+        for (int k = 0; k < numRows; k++) {
+            if (isMoving && nextCluster != firstRows.end() && *nextCluster == k) {
+                clusterStart.push_back((int) atoms.size());
+                nextCluster++;
+            }
+            for (int i : rows[k].particles)
+                if ((masses[i] > 0) == isMoving && placeOf.emplace(i, (int) atoms.size()).second)
+                    atoms.push_back(i);
+        }
+        if (isMoving)
+            clusterStart.push_back((int) atoms.size());
+    }
     const int numParticles = (int) atoms.size();
 
     // An order of elimination.
@@ -295,12 +311,15 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<double>& 
     addList(RowStart, rowStart);
     addList(RowSlot, rowSlot);
     addList(RowColumn, rowColumn);
+    table[NumClusters] = (int) firstRows.size();
+    addList(ClusterStart, clusterStart);
     parts.push_back((int) tables.size());
     tables.insert(tables.end(), table.begin(), table.end());
     places.insert(places.end(), atoms.begin(), atoms.end());
     numConstraints += numRows;
-    // Vectors, G twice, numbers of the rows, the factors of K and of Newton's matrix; see openPart() in kernels/expression.cc.
-    numWork += 16 * (size_t) numParticles + 6 * (size_t) numEntries + 7 * (size_t) numRows + 3 * (size_t) numSlots;
+    // Vectors and terms, G twice, numbers of the rows, the factors of K and of Newton's matrix; see openPart() in kernels/expression.cc.
+    numWork += (16 + NUM_TERMS) * (size_t) numParticles + 6 * (size_t) numEntries + 7 * (size_t) numRows +
+               3 * (size_t) numSlots;
     numLevels = std::max(numLevels, elimination.numLevels);
     numFactorEntries = std::max(numFactorEntries, (size_t) numSlots);
 }

@@ -26,6 +26,8 @@ class ExpressionClusters {
 public:
     /** A part has about so many constraints, or one cluster. */
     static const int PART_SIZE = 128;
+    /** There is room for so many numbers of each particle, which are added up over its cluster. */
+    static const int NUM_TERMS = 6;
 
     ExpressionClusters(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
     bool isEmpty() const {
@@ -73,7 +75,7 @@ public:
 
 private:
     struct Row;
-    void addPart(const std::vector<Row>& rows, const std::vector<double>& masses);
+    void addPart(const std::vector<Row>& rows, const std::vector<int>& firstRows, const std::vector<double>& masses);
     int kindOf(const ExpressionConstraint& constraint);
     std::vector<char> isMember;
     std::vector<std::unique_ptr<ExpressionDerivatives>> kinds; // the first is that of distances

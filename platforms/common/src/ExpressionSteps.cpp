@@ -134,12 +134,12 @@ void ExpressionSteps::updateShifts() {
     shifts.upload(data, true);
 }
 
-void ExpressionSteps::launchFinish(Kernels& kernels, int step, double kick, bool isFormed, bool isStored,
+void ExpressionSteps::launchFinish(Kernels& kernels, int step, double kick, int change, bool isStored,
                                    ComputeArray& control) {
     updateShifts();
     kernels.finish->setArg(0, step);
     setMixed(kernels.finish, 1, kick);
-    kernels.finish->setArg(2, (int) isFormed);
+    kernels.finish->setArg(2, change);
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control);
     launch(kernels.finish);

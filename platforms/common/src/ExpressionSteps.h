@@ -43,7 +43,7 @@ public:
 
     /** Take over the parameters of all expressions; returns whether they are others. */
     bool setParameters(const std::vector<ExpressionConstraint>& expressions);
-    void launchFinish(Kernels& kernels, int step, double kick, bool isFormed, bool isStored,
+    void launchFinish(Kernels& kernels, int step, double kick, int change, bool isStored,
                       OpenMM::ComputeArray& control);
     void launchTrial(Kernels& kernels, int step, double tolerance, OpenMM::ComputeArray& nextTrial,
                      OpenMM::ComputeArray& nextPartials);

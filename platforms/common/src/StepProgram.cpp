@@ -450,5 +450,6 @@ void StepProgram::writeExpressions(const ExpressionClusters& expressions) {
     defines["EXPRESSION_LENGTH"] = literal(ConstraintSystem::EXPRESSION_LENGTH);
     defines["MAX_CHORD_ITERATIONS"] = to_string(MAX_CHORD_ITERATIONS);
     defines["SMALLEST_SHARE"] = "1e-4f";
+    defines["PART_TERMS"] = to_string(ExpressionClusters::NUM_TERMS);
     defines["MAX_PART_ITERATIONS"] = to_string(MAX_PART_ITERATIONS);
 }

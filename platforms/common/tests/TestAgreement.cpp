@@ -435,58 +435,66 @@ void testRod() {
         ASSERT(std::fabs(found[k] - expected[k]) <= 1e-6 * largestOf(expected));
 }
 
+// Molecules of expressions that leave a box.
+struct Pearls : TestSystem {
+    const double edge = 2.2;
+    Expressions expressions;
+    vector<std::map<std::string, double>> parameters;
+
+    Pearls() {
+        system.setDefaultPeriodicBoxVectors(Vec3(edge, 0, 0), Vec3(0.4, edge, 0), Vec3(-0.3, 0.5, edge));
+        auto* nonbonded = new NonbondedForce(); // with which OpenMM sorts molecules; they do not act on each other
+        nonbonded->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
+        nonbonded->setCutoffDistance(1.0);
+        auto* field = new CustomExternalForce("-3*x+2*z");
+        auto add = [&](double mass, const Vec3& position, const Vec3& velocity) {
+            positions.push_back(position);
+            velocities.push_back(velocity);
+            nonbonded->addParticle(0, 0.1, 0);
+            const int index = system.addParticle(mass);
+            field->addParticle(index);
+            return index;
+        };
+        for (int i = 0; i < 24; i++) { // dumbbells, of which two have another length
+            const double length = i == 5 || i == 17 ? 0.15 : 0.1;
+            const Vec3 centre(0.37 * i, 0.21 * (i % 7), 0.33 * (i % 5)),
+                velocity(2 - 0.3 * i, 1.5 * std::sin(i), 4 * std::cos(i));
+            const int first = add(4, centre, velocity), second = add(4, centre + Vec3(0, length, 0), velocity * 0.8);
+            expressions.emplace_back("sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-r", vector<int>{first, second});
+            parameters.push_back({{"r", length}});
+        }
+        for (int i = 0; i < 6; i++) { // on rings that are wider than the box
+            const double angle = i;
+            expressions.emplace_back("x1^2+y1^2-r",
+                                     vector<int>{add(3, Vec3(1.5 * std::cos(angle), 1.5 * std::sin(angle), 0),
+                                                     Vec3(-5 * std::sin(angle), 5 * std::cos(angle), 2))});
+            parameters.push_back({{"r", 2.25}});
+        }
+        // Two molecules with distances of their own, far from each other.
+        const int one = add(4, Vec3(0, 0.05, 0.05), Vec3(3, 1, 0)),
+                  other = add(2, Vec3(0.1, 0.05, 0.05), Vec3(3, 2, 0));
+        const int far = add(4, Vec3(4, 0.3, 1), Vec3(2, 3, -5)), last = add(2, Vec3(4.1, 0.3, 1), Vec3(2, 3, -5));
+        system.addConstraint(one, other, 0.1);
+        system.addConstraint(far, last, 0.1);
+        expressions.emplace_back("x1+y1+z1-x2-y2-z2+r", vector<int>{one, far});
+        parameters.push_back({{"r", 5.2}});
+        system.addForce(nonbonded);
+        system.addForce(field);
+    }
+};
+
 // Expressions are not periodic: where OpenMM moves molecules by box vectors, and changes the places of identical ones, they are of
 // the positions that users see, and each stays with its own molecule.
 void testExpressionsInABox() {
-    TestSystem t;
-    const double edge = 2.2;
-    t.system.setDefaultPeriodicBoxVectors(Vec3(edge, 0, 0), Vec3(0.4, edge, 0), Vec3(-0.3, 0.5, edge));
-    auto* nonbonded = new NonbondedForce(); // with which OpenMM sorts molecules; they do not act on each other
-    nonbonded->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
-    nonbonded->setCutoffDistance(1.0);
-    auto* field = new CustomExternalForce("-3*x+2*z");
-    Expressions expressions;
-    vector<std::map<std::string, double>> parameters;
-    auto add = [&](double mass, const Vec3& position, const Vec3& velocity) {
-        t.positions.push_back(position);
-        t.velocities.push_back(velocity);
-        nonbonded->addParticle(0, 0.1, 0);
-        const int index = t.system.addParticle(mass);
-        field->addParticle(index);
-        return index;
-    };
-    for (int i = 0; i < 24; i++) { // dumbbells, of which two have another length
-        const double length = i == 5 || i == 17 ? 0.15 : 0.1;
-        const Vec3 centre(0.37 * i, 0.21 * (i % 7), 0.33 * (i % 5)),
-            velocity(2 - 0.3 * i, 1.5 * std::sin(i), 4 * std::cos(i));
-        const int first = add(4, centre, velocity), second = add(4, centre + Vec3(0, length, 0), velocity * 0.8);
-        expressions.emplace_back("sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-r", vector<int>{first, second});
-        parameters.push_back({{"r", length}});
-    }
-    for (int i = 0; i < 6; i++) { // on rings that are wider than the box
-        const double angle = i;
-        expressions.emplace_back("x1^2+y1^2-r",
-                                 vector<int>{add(3, Vec3(1.5 * std::cos(angle), 1.5 * std::sin(angle), 0),
-                                                 Vec3(-5 * std::sin(angle), 5 * std::cos(angle), 2))});
-        parameters.push_back({{"r", 2.25}});
-    }
-    // Two molecules with distances of their own, far from each other.
-    const int one = add(4, Vec3(0, 0.05, 0.05), Vec3(3, 1, 0)), other = add(2, Vec3(0.1, 0.05, 0.05), Vec3(3, 2, 0));
-    const int far = add(4, Vec3(4, 0.3, 1), Vec3(2, 3, -5)), last = add(2, Vec3(4.1, 0.3, 1), Vec3(2, 3, -5));
-    t.system.addConstraint(one, other, 0.1);
-    t.system.addConstraint(far, last, 0.1);
-    expressions.emplace_back("x1+y1+z1-x2-y2-z2+r", vector<int>{one, far});
-    parameters.push_back({{"r", 5.2}});
-    t.system.addForce(nonbonded);
-    t.system.addForce(field);
-    On here(t, getTestPlatform(), expressions, parameters), there(t, reference(), expressions, parameters);
+    const Pearls t;
+    On here(t, getTestPlatform(), t.expressions, t.parameters), there(t, reference(), t.expressions, t.parameters);
     for (On* each : {&here, &there}) {
         each->integrator.setConstraintTolerance(choose(1e-11, 1e-10, 1e-5));
         each->context.setPositions(t.positions);
         each->context.setVelocities(t.velocities);
         each->integrator.step(900); // OpenMM sorts every 250 steps
     }
-    ASSERT(largestDifference(t.positions, there.positions()) > 1.5 * edge);
+    ASSERT(largestDifference(t.positions, there.positions()) > 1.5 * t.edge);
     ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-8, 1e-3, 1e-1));
     // Other lengths for molecules that were identical: what follows knows which is which.
     for (On* each : {&here, &there}) {
@@ -497,18 +505,67 @@ void testExpressionsInABox() {
     ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-7, 1e-2, 1));
 }
 
+// The same with automatic step control, which compares the forces of each particle with those before: with references below what the
+// monitors are, so that steps are short and vary. A State goes to Reference and back.
+void testAutomaticControlOfExpressions() {
+    const Pearls t;
+    On here(t, getTestPlatform(), t.expressions, t.parameters), there(t, reference(), t.expressions, t.parameters),
+        next(t, reference(), t.expressions, t.parameters);
+    const auto requireAgreement = [](On& one, On& other, double distance, double fraction) {
+        ASSERT(largestDifference(one.positions(), other.positions()) <= distance);
+        ASSERT_EQUAL_TOL(one.integrator.getStepDensity(), other.integrator.getStepDensity(), fraction);
+        for (int k = 0; k < 2; k++) {
+            ASSERT_EQUAL_TOL(one.integrator.getMonitorValue(k), other.integrator.getMonitorValue(k), fraction);
+            ASSERT_EQUAL_TOL(one.integrator.getReferenceMonitorValue(k), other.integrator.getReferenceMonitorValue(k),
+                             fraction);
+        }
+    };
+    for (On* each : {&here, &there, &next}) {
+        each->integrator.setConstraintTolerance(choose(1e-11, 1e-10, 1e-5));
+        each->integrator.useAutomaticStepControl(10);
+    }
+    for (On* each : {&here, &there}) {
+        each->context.setPositions(t.positions);
+        each->context.setVelocities(t.velocities);
+        each->integrator.step(15);
+        ASSERT_EQUAL(each == &here, each->integrator.isOnDevice());
+    }
+    requireAgreement(there, here, choose(1e-10, 1e-5, 1e-2), choose(1e-7, 1e-2, 1e-1));
+    const double values[] = {there.integrator.getReferenceMonitorValue(0) / 8,
+                             there.integrator.getReferenceMonitorValue(1) / 8};
+    for (On* each : {&here, &there})
+        for (int k = 0; k < 2; k++)
+            each->integrator.setReferenceMonitorValue(values[k], k);
+    for (On* each : {&here, &there})
+        each->integrator.step(900);
+    ASSERT(there.integrator.getStepDensity() > 1.5);
+    ASSERT_EQUAL(there.integrator.getNumForceEvaluations(), here.integrator.getNumForceEvaluations());
+    requireAgreement(there, here, choose(1e-8, 1e-3, 1), choose(1e-6, 1e-1, 1));
+    load(next.context, save(here.context));
+    for (On* each : {&here, &next})
+        each->integrator.step(20);
+    requireAgreement(next, here, choose(1e-9, 1e-3, 1), choose(1e-6, 1e-1, 1));
+    load(here.context, save(next.context));
+    for (On* each : {&here, &next})
+        each->integrator.step(20);
+    ASSERT(here.integrator.isOnDevice());
+    requireAgreement(next, here, choose(1e-9, 1e-3, 1), choose(1e-6, 1e-1, 1));
+}
+
 } // namespace
 
 int main(int argc, char** argv) {
-    return runOnPlatform({{"agreement with Reference", testAgreement},
-                          {"States move between platforms", testStatesMove},
-                          {"reversal", testReversal},
-                          {"energies in between", testEnergiesInBetween},
-                          {"a barostat", [] { testBarostat(false); }},
-                          {"a barostat and automatic step control", [] { testBarostat(true); }},
-                          {"thermostats and automatic step control", testAutomaticControlUnderThermostats},
-                          {"a failure in the middle of a block", testFailureInTheMiddle},
-                          {"a rod of expressions and distances", testRod},
-                          {"expressions in a periodic box", testExpressionsInABox}},
-                         argc, argv);
+    return runOnPlatform(
+        {{"agreement with Reference", testAgreement},
+         {"States move between platforms", testStatesMove},
+         {"reversal", testReversal},
+         {"energies in between", testEnergiesInBetween},
+         {"a barostat", [] { testBarostat(false); }},
+         {"a barostat and automatic step control", [] { testBarostat(true); }},
+         {"thermostats and automatic step control", testAutomaticControlUnderThermostats},
+         {"a failure in the middle of a block", testFailureInTheMiddle},
+         {"a rod of expressions and distances", testRod},
+         {"expressions in a periodic box", testExpressionsInABox},
+         {"automatic step control of expressions in a periodic box", testAutomaticControlOfExpressions}},
+        argc, argv);
 }

@@ -322,6 +322,100 @@ void testFailure() {
     ASSERT(largestDifference(stopped.positions(), run.positions()) <= 1000 * rounding);
 }
 
+// Dumbbells and chains of ten whose bonds are expressions, in a field: steps are taken by the device, agree with Reference, those with
+// substeps in between as well; and the temperature, within four of its standard errors, along the bonds and across them.
+void testExpressions() {
+    const double masses[] = {14, 3}, length = 0.12, stepSize = 0.004;
+    const char distance[] = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-r";
+    const int numDumbbells = 150, numChains = 15, chainSize = 10;
+    System system;
+    vector<Vec3> positions;
+    auto* field = new CustomExternalForce("20*(x^2+y^2+z^2)+3*cos(9*x)*sin(7*y+5*z)");
+    VariableStepRattleLangevinIntegrator settings(300, 20, stepSize);
+    settings.setRandomNumberSeed(5);
+    settings.setConstraintTolerance(choose(1e-10, 1e-8, 1e-5));
+    auto add = [&](const Vec3& position) {
+        positions.push_back(position);
+        const int index = system.addParticle(masses[positions.size() % 2]);
+        field->addParticle(index);
+        return index;
+    };
+    for (int i = 0; i < numDumbbells + numChains; i++) {
+        Vec3 place(0.3 * std::cos(i), 0.3 * std::sin(2 * i), 0.3 * std::sin(i + 1));
+        for (int j = 0; j < (i < numDumbbells ? 2 : chainSize); j++) {
+            const int index = add(place);
+            place += Vec3(j % 2 == 0 ? 0.8 : 0.6, j % 2 == 0 ? 0.6 : -0.8, 0) * length;
+            if (j > 0)
+                settings.addConstraint(distance, {index - 1, index}, {{"r", length}});
+        }
+    }
+    system.addForce(field);
+    VariableStepRattleLangevinIntegrator integrators[2] = {settings, settings};
+    Context there(system, integrators[0], reference()), here(system, integrators[1], getTestPlatform());
+    Context* contexts[] = {&there, &here};
+    for (Context* context : contexts) {
+        context->setPositions(positions);
+        context->setVelocitiesToTemperature(300, 7);
+    }
+    const auto positionsOf = [](Context& context) { return context.getState(State::Positions).getPositions(); };
+    const auto requireAgreement = [&](int steps, double distanceBound, double fraction) {
+        for (auto& integrator : integrators)
+            integrator.step(steps);
+        ASSERT_EQUAL(integrators[0].getNumSubstepped(), integrators[1].getNumSubstepped());
+        ASSERT(largestDifference(positionsOf(there), positionsOf(here)) <= distanceBound);
+        ASSERT_EQUAL_TOL(there.getState(State::Energy).getKineticEnergy(),
+                         here.getState(State::Energy).getKineticEnergy(), fraction);
+        ASSERT_EQUAL_TOL(integrators[0].getMonitorValue(), integrators[1].getMonitorValue(), fraction);
+    };
+    requireAgreement(1, choose(1e-9, 1e-6, 1e-5), choose(1e-6, 1e-5, 1e-4));
+    requireAgreement(60, choose(1e-8, 1e-4, 1e-2), choose(1e-5, 1e-2, 1e-1));
+    ASSERT(integrators[1].isOnDevice());
+    const long long before = integrators[0].getNumSubstepped();
+    const double u = integrators[0].getMonitorValue();
+    for (auto& integrator : integrators)
+        integrator.setReferenceMonitorValue(u / 3.26);
+    requireAgreement(20, choose(1e-8, 1e-3, 1e-1), choose(1e-5, 1e-2, 1e-1));
+    ASSERT(integrators[0].getNumSubstepped() > before + 2);
+    ASSERT(integrators[0].getNumSubstepped() < before + 20);
+    for (auto& integrator : integrators)
+        integrator.setReferenceMonitorValue(3 * u);
+
+    const int numBlocks = 20, numSamples = 15;
+    const double degrees[] = {3.0 * numDumbbells, 2.0 * numDumbbells, (2.0 * chainSize + 1) * numChains};
+    double sums[3] = {}, squares[3] = {};
+    for (int block = 0; block < numBlocks; block++) {
+        double means[3] = {}; // of the centres of dumbbells, of their rotation, and of chains
+        for (int sample = 0; sample < numSamples; sample++) {
+            integrators[1].step(10);
+            const State state = here.getState(State::Positions | State::Velocities);
+            const vector<Vec3>&q = state.getPositions(), &v = state.getVelocities();
+            for (int i = 0; i < 2 * numDumbbells; i += 2) {
+                const double m1 = system.getParticleMass(i), m2 = system.getParticleMass(i + 1);
+                const Vec3 centre = (v[i] * m1 + v[i + 1] * m2) / (m1 + m2), relative = v[i] - v[i + 1],
+                           r = q[i] - q[i + 1];
+                means[0] += (m1 + m2) * centre.dot(centre);
+                means[1] += m1 * m2 / (m1 + m2) * relative.dot(relative);
+                ASSERT(std::fabs(r.dot(relative)) <= choose(1e-8, 1e-6, 1e-3)); // of some 0.1 nm^2/ps
+                ASSERT_EQUAL_TOL(length, std::sqrt(r.dot(r)), choose(1e-9, 1e-6, 1e-4));
+            }
+            for (size_t i = 2 * numDumbbells; i < v.size(); i++)
+                means[2] += system.getParticleMass((int) i) * v[i].dot(v[i]);
+        }
+        for (int k = 0; k < 3; k++) {
+            const double temperature = means[k] / (numSamples * degrees[k] * BOLTZMANN_CONSTANT);
+            sums[k] += temperature / numBlocks;
+            squares[k] += temperature * temperature / numBlocks;
+        }
+    }
+    for (int k = 0; k < 3; k++) {
+        const double error = std::sqrt((squares[k] - sums[k] * sums[k]) / (numBlocks - 1));
+        std::cout << "temperature " << sums[k] << " +- " << error << " K" << std::endl;
+        ASSERT(error < 3);
+        ASSERT(std::fabs(sums[k] - 300) < 4 * error);
+    }
+    ASSERT(integrators[1].isOnDevice());
+}
+
 } // namespace
 
 int main(int argc, char** argv) {
@@ -331,6 +425,7 @@ int main(int argc, char** argv) {
                           {"States move between platforms", testStatesMove},
                           {"a barostat", testBarostat},
                           {"temperature", testTemperature},
-                          {"failure", testFailure}},
+                          {"failure", testFailure},
+                          {"constraints by expression", testExpressions}},
                          argc, argv);
 }

@@ -39,6 +39,8 @@ CASES = (
     ),
     ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "expressions", ("sm_70", "sm_90")),
     ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "expressions", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "expressions", ("sm_70", "sm_90")),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "expressions", ("sm_70", "sm_90")),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.

@@ -726,7 +726,8 @@ void testAutomaticControl(const Molecules& molecules, const std::string& precisi
     // As many launches as the update Explicit, and one to read.
     const LargeClusters& large = both.device.getLargeClusters();
     const int numLarge = large.isEmpty() ? 0 : large.getForm().isStaged ? 3 + 16 : 2;
-    ASSERT_EQUAL(20 * (2 + numLarge) + 1, both.device.getNumLaunches() - before);
+    const int numExpressions = molecules.expressions.empty() ? 0 : 2;
+    ASSERT_EQUAL(20 * (2 + numLarge + numExpressions) + 1, both.device.getNumLaunches() - before);
     ASSERT(both.dynamics.getDensity() > 3);
     both.requireStepsToAgree(3, 0.0001, 100 * distance, 100 * fraction);
     both.requireStepsToAgree(3, 0.00001, 100 * distance, 100 * fraction);
@@ -811,15 +812,18 @@ void testFailureLeavesTheStateBefore(const std::string& precision, int length = 
 }
 
 // The same with automatic step control, whose numbers are those of the state before too: a wall that is too hard, or whose force is no
-// number, which is noticed a step earlier and when all sums are others already.
-void testFailureOfAutomaticControl(const std::string& precision) {
+// number, which is noticed a step earlier and when all sums are others already. The dumbbell is a distance or an expression.
+void testFailureOfAutomaticControl(const std::string& precision, bool hasExpression) {
     Molecules molecules(1);
     const int first = molecules.system.getNumParticles();
     for (int i = 0; i < 2; i++) {
         molecules.addParticle(12, Vec3(3, 0.1 * i, 0));
         molecules.velocities[first + i] = Vec3(1, 0, 0);
     }
-    molecules.addConstraint(first, first + 1);
+    if (hasExpression)
+        molecules.addExpression(DISTANCE, {first, first + 1});
+    else
+        molecules.addConstraint(first, first + 1);
     auto* wall = new OpenMM::CustomExternalForce("select(step(x-3.0295), select(isBad, sqrt(3.0295-x), 1e9*x), 0)");
     wall->addGlobalParameter("isBad", 0);
     wall->addParticle(first);
@@ -950,7 +954,8 @@ struct BothLangevin {
 
     BothLangevin(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
-            dynamics(molecules.masses, molecules.constraints), device(lender.getDevice(), molecules.system),
+            dynamics(molecules.masses, molecules.constraints, molecules.expressions),
+            device(lender.getDevice(), molecules.system, molecules.expressions),
             tolerance(DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12)) {
         LangevinSettings langevin;
         langevin.temperature = 300;
@@ -975,13 +980,16 @@ struct BothLangevin {
         } while (!dynamics.finish(forces, 0));
     }
     void handOver() {
-        const LangevinDynamics::Noise noise = dynamics.findNoise();
+        begin(dynamics.getPositions(), dynamics.getVelocities(), dynamics.findNoise());
+    }
+    // Let the device go on from a state with the host's random numbers, a and sqrt(kT (1 - a^2)) being given.
+    void begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const LangevinDynamics::Noise& noise) {
         DeviceSteps::Settings settings = {
             stepSize, StepDensity(StepDensity::Explicit, stepSize, 0, 0), StepDensity::Explicit, true, tolerance, {}};
         settings.langevin = DeviceSteps::Langevin{noise.damping, noise.size, dynamics.findFloor(),
                                                   dynamics.getFollowingFactor(), dynamics.findLargestCalm()};
-        forcesAt(dynamics.getPositions());
-        context.setVelocities(dynamics.getVelocities());
+        forcesAt(positions);
+        context.setVelocities(velocities);
         device.setSettings(settings);
         DeviceSteps::State state = {1, 0, false, 0};
         state.reference = dynamics.getReferences()[0];
@@ -994,14 +1002,43 @@ struct BothLangevin {
         lender.getContext().calcForcesAndEnergy(true, false, 1);
         device.finish(0);
     }
+    vector<Vec3> positions() {
+        return context.getState(OpenMM::State::Positions).getPositions();
+    }
+    vector<Vec3> velocities() {
+        return context.getState(OpenMM::State::Velocities).getVelocities();
+    }
+    // One step from the host's state, and back with the velocities and the noise turned around. The noise turns v into a v + s xi, and
+    // the reversed one -(a v + s xi) into -v: that is the same numbers xi with 1/a and s/a in place of a and s.
+    void requireRetracing(double distance) {
+        handOver();
+        const vector<Vec3> before = positions(), velocitiesBefore = velocities();
+        stepOnDevice();
+        ASSERT(!device.read().hasFailed);
+        const vector<Vec3> after = positions();
+        ASSERT(largestDifference(before, after) > 1e-3);
+        vector<Vec3> turned = velocities();
+        for (Vec3& each : turned)
+            each = -each;
+        const LangevinDynamics::Noise noise = dynamics.findNoise();
+        begin(after, turned, {1 / noise.damping, noise.size / noise.damping});
+        stepOnDevice();
+        ASSERT(!device.read().hasFailed);
+        ASSERT(largestDifference(before, positions()) <= distance);
+        turned = velocities();
+        for (size_t i = 0; i < turned.size(); i++)
+            if (context.getSystem().getParticleMass((int) i) > 0)
+                ASSERT(largestDifference({-turned[i]}, {velocitiesBefore[i]}) <= 1000 * distance);
+    }
 };
 
-// From a state in the middle of a run: the first calm steps, one and a hundred.
+// From a state in the middle of a run: a step there and back, then the first calm steps, one and a hundred.
 void testLangevinAgrees(const Molecules& molecules, const std::string& precision, double distance, double fraction) {
     BothLangevin both(molecules, precision);
     for (int i = 0; i < 20; i++)
         both.stepOnHost();
     both.dynamics.setReferences({1.2 * both.dynamics.getMonitorValues()[0]});
+    both.requireRetracing(distance);
     both.handOver();
     const long long substepped = both.dynamics.getNumSubstepped();
     for (int steps : {1, 99}) {
@@ -1009,11 +1046,11 @@ void testLangevinAgrees(const Molecules& molecules, const std::string& precision
         for (int i = 0; i < steps; i++)
             both.stepOnDevice();
         const LargeClusters& large = both.device.getLargeClusters();
-        const int perStep = large.isEmpty() ? 2 : !large.getForm().isStaged ? 4 : 2 + 3 + 28;
+        const int numLarge = large.isEmpty() ? 0 : large.getForm().isStaged ? 3 + 28 : 2;
+        const int perStep = 2 + numLarge + (molecules.expressions.empty() ? 0 : 2);
         ASSERT_EQUAL(perStep * steps, both.device.getNumLaunches() - launches);
         const DeviceSteps::Report report = both.device.read();
-        const vector<Vec3> positions = both.context.getState(OpenMM::State::Positions).getPositions();
-        const vector<Vec3> velocities = both.context.getState(OpenMM::State::Velocities).getVelocities();
+        const vector<Vec3> positions = both.positions(), velocities = both.velocities();
         for (int i = 0; i < steps; i++)
             both.stepOnHost();
         ASSERT_EQUAL(substepped, both.dynamics.getNumSubstepped());
@@ -1098,6 +1135,8 @@ int main(int argc, char** argv) {
         {"automatic step control, double", [] { testAutomaticControl(Molecules(2), "double", 1e-12, 1e-9); }},
         {"automatic step control of large clusters, double",
          [] { testAutomaticControl(makeMolecules({makeChain(20), makeProtein(30)}), "double", 1e-12, 1e-9); }},
+        {"automatic step control with expressions, double",
+         [] { testAutomaticControl(makeExpressions(), "double", 1e-12, 1e-9); }},
         {"automatic step control, single", [] { testAutomaticControl(Molecules(2), "single", 1e-6, 1e-3); }},
         {"a failure leaves the state before, double", [] { testFailureLeavesTheStateBefore("double"); }},
         {"a failure leaves the state before, single", [] { testFailureLeavesTheStateBefore("single"); }},
@@ -1105,7 +1144,9 @@ int main(int argc, char** argv) {
          [] { testFailureLeavesTheStateBefore("double", 30); }},
         {"a failure of a large cluster in pieces leaves the state before, mixed",
          [] { testFailureLeavesTheStateBefore("mixed", 400); }},
-        {"a failure with automatic step control, double", [] { testFailureOfAutomaticControl("double"); }},
+        {"a failure with automatic step control, double", [] { testFailureOfAutomaticControl("double", false); }},
+        {"a failure with automatic step control and an expression, double",
+         [] { testFailureOfAutomaticControl("double", true); }},
         {"expressions are written as they are evaluated", testExpressionCode},
         {"Langevin, double", [] { testLangevinAgrees(Molecules(2), "double", 1e-12, 1e-9); }},
         {"Langevin, mixed", [] { testLangevinAgrees(Molecules(2), "mixed", 1e-9, 1e-6); }},
@@ -1117,6 +1158,8 @@ int main(int argc, char** argv) {
              testLangevinAgrees(makeMolecules({makeRing(30), makeChain(400), makeProtein(30), makeStar(4, 60)}),
                                 "double", 1e-12, 1e-9);
          }},
+        {"Langevin, expressions, double", [] { testLangevinAgrees(makeExpressions(), "double", 1e-12, 1e-9); }},
+        {"Langevin, expressions, mixed", [] { testLangevinAgrees(makeExpressions(), "mixed", 1e-9, 1e-6); }},
         {"what it takes", testWhatItTakes}};
     if (argc > 1)
         tests = {tests.at(std::stoi(argv[1]))};

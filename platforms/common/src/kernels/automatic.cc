@@ -112,21 +112,6 @@ inline DEVICE void addCluster(mixed* sums, const mixed* terms, LastState last, i
 // What a piece leaves in the place of sums is what is added up over the pieces of its cluster: A_c, w.(F[n] - F[n-1]) times the rate,
 // the mean of S_c, and the others.
 
-/** Add up the terms of all threads of a work group; thread 0 gets the result. */
-inline DEVICE void addTermsInGroup(mixed* terms, LOCAL_ARG mixed* buffer) {
-    for (int j = 0; j < NUM_TERMS; j++)
-        buffer[j*GROUP_SIZE + LOCAL_ID] = terms[j];
-    for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
-        SYNC_THREADS;
-        if (LOCAL_ID < width)
-            for (int j = 0; j < NUM_TERMS; j++)
-                buffer[j*GROUP_SIZE + LOCAL_ID] += buffer[j*GROUP_SIZE + LOCAL_ID + width];
-    }
-    SYNC_THREADS;
-    for (int j = 0; j < NUM_TERMS; j++)
-        terms[j] = buffer[j*GROUP_SIZE];
-}
-
 inline DEVICE void closePiece(mixed* terms, LastState last, int firstAtom, int numPieces) {
     const mixed squares = terms[TERM_SQUARES];
     terms[0] = squares + terms[TERM_FLIGHT];

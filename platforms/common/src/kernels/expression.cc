@@ -12,12 +12,12 @@
 EXPRESSION_FUNCTIONS
 
 typedef struct {
-    int numRows, numParticles, numEntries, numSlots, numLevels, numCoupled;
+    int numRows, numParticles, numEntries, numSlots, numLevels, numCoupled, numClusters;
     GLOBAL const int *atoms, *order, *kinds, *rowEntry, *rowParameter, *places, *incidenceStart, *incidence;
-    GLOBAL const int *coupledSlots, *productStart, *products, *levels, *columnStart, *slotRow, *slotColumn, *rowStart, *rowSlot, *rowColumn;
+    GLOBAL const int *coupledSlots, *productStart, *products, *levels, *columnStart, *slotRow, *slotColumn, *rowStart, *rowSlot, *rowColumn, *clusterStart;
     GLOBAL const mixed* shifts;
     GLOBAL mixed *multipliers;
-    GLOBAL mixed *position, *base, *moved, *acceleration, *before, *inverseMass; // of each particle
+    GLOBAL mixed *position, *base, *moved, *acceleration, *before, *inverseMass, *terms; // of each particle
     GLOBAL mixed *G, *nextG;                                                     // entries
     GLOBAL mixed *solution, *gamma, *right, *diagonal, *scale;                   // of each row
     GLOBAL mixed *pivots, *lower;                                                // the factor of K
@@ -68,6 +68,8 @@ inline DEVICE Part openPart(GLOBAL const int* table, GLOBAL mixed* work, GLOBAL 
     part.rowStart = table + table[24];
     part.rowSlot = table + table[25];
     part.rowColumn = table + table[26];
+    part.numClusters = table[27];
+    part.clusterStart = table + table[28];
 #define TAKE(name, size) part.name = next; next += (size);
     TAKE(position, 3*part.numParticles)
     TAKE(base, 3*part.numParticles)
@@ -75,6 +77,7 @@ inline DEVICE Part openPart(GLOBAL const int* table, GLOBAL mixed* work, GLOBAL 
     TAKE(acceleration, 3*part.numParticles)
     TAKE(before, 3*part.numParticles)
     TAKE(inverseMass, part.numParticles)
+    TAKE(terms, PART_TERMS*part.numParticles)
     TAKE(G, 3*part.numEntries)
     TAKE(nextG, 3*part.numEntries)
     TAKE(solution, part.numRows)
@@ -305,6 +308,75 @@ inline DEVICE void measurePart(const Part* part, GLOBAL const mixed* v, const Pa
     }
 }
 
+#if UPDATE == AUTOMATIC
+#define CLUSTER_TERM_COUNT NUM_TERMS
+#define ADD_CLUSTER_OF_PART(terms, firstAtom) (addCluster(sums, terms, last, firstAtom), true)
+#elif CLUSTER_SUMS
+#define CLUSTER_TERM_COUNT 1
+#define ADD_CLUSTER_OF_PART(terms, firstAtom) addCluster(sums, (terms)[0])
+#endif
+
+#ifdef CLUSTER_TERM_COUNT
+
+#if CLUSTER_TERM_COUNT > PART_TERMS
+#error the parts have no room for the terms
+#endif
+
+/**
+ * What the clusters of a part add to the sums, where solution is Lambda(q,v): first the terms of each particle, then a thread
+ * adds up those of a cluster, or all threads those of the only one. Returns false if one is no number.
+ */
+inline DEVICE bool addClustersOfPart(const Part* part, GLOBAL const mixed* v, GLOBAL const mm_long* RESTRICT force, int paddedNumAtoms, mixed* sums,
+        LOCAL_ARG mixed* buffer LAST_STATE_PARAMETER) {
+    const int numMoving = part->clusterStart[part->numClusters];
+    pushParticles(part, part->solution, -1, part->acceleration, part->base); // by the net force
+    KEEP_LOOP for (int i = THREAD; i < numMoving; i += NUM_THREADS) {
+        mixed terms[CLUSTER_TERM_COUNT], u[3], a[3];
+        UNROLL for (int d = 0; d < 3; d++) {
+            u[d] = v[3*i+d];
+            a[d] = part->base[3*i+d];
+        }
+        const mixed w = part->inverseMass[i];
+#if UPDATE == AUTOMATIC
+        const int atom = part->atoms[i];
+        mixed applied[3];
+        const mixed forceSquared = loadAcceleration(force, paddedNumAtoms, atom, w, applied);
+        for (int j = 0; j < CLUSTER_TERM_COUNT; j++)
+            terms[j] = 0;
+        followForce(terms, last, force, paddedNumAtoms, atom, w, part->before[3*i], part->before[3*i+1], part->before[3*i+2]);
+        addFlight(terms, forceSquared, u);
+        addAutomaticTerms(terms, last, atom, w, u, a);
+#else
+        terms[0] = shareOf(dot3(a, a), w, u);
+#endif
+        for (int j = 0; j < CLUSTER_TERM_COUNT; j++)
+            part->terms[j*part->numParticles + i] = terms[j];
+    }
+    SYNC_PIECE;
+    const bool isOnly = (part->numClusters == 1);
+    const int first = (isOnly ? THREAD : 0), stride = (isOnly ? NUM_THREADS : 1);
+    mixed terms[CLUSTER_TERM_COUNT];
+    bool isRegular = true;
+    KEEP_LOOP for (int c = (isOnly ? 0 : THREAD); c < part->numClusters; c += (isOnly ? 1 : NUM_THREADS)) {
+        for (int j = 0; j < CLUSTER_TERM_COUNT; j++)
+            terms[j] = 0;
+        KEEP_LOOP for (int i = part->clusterStart[c] + first; i < part->clusterStart[c+1]; i += stride)
+            for (int j = 0; j < CLUSTER_TERM_COUNT; j++)
+                terms[j] += part->terms[j*part->numParticles + i];
+        if (!isOnly)
+            isRegular = ADD_CLUSTER_OF_PART(terms, part->atoms[part->clusterStart[c]]) && isRegular;
+    }
+    if (isOnly) {
+        ADD_IN_GROUP(terms, CLUSTER_TERM_COUNT);
+        if (THREAD == 0)
+            isRegular = ADD_CLUSTER_OF_PART(terms, part->atoms[0]);
+    }
+    SYNC_PIECE;
+    return isRegular;
+}
+
+#endif
+
 /** The largest of a number that each thread has; what is none counts as very large. */
 inline DEVICE mixed findLargest(mixed value, LOCAL_ARG mixed* buffer) {
     mixed largest = (value < (mixed) 1e30f ? value : (mixed) 1e30f);
@@ -323,11 +395,11 @@ inline DEVICE mixed findLargest(mixed value, LOCAL_ARG mixed* buffer) {
 }
 
 /**
- * Solve g(q + base + M^-1 G^T gamma) = 0 from gamma = -dt^2/2 lambda; moved is the way there. Returns the number of iterations, or -1 if they
+ * Solve g(q + base + M^-1 G^T gamma) = 0 from gamma = -guess lambda; moved is the way there, and acceleration what it leads to. G and the
+ * factor of K are those of q. Returns the number of iterations, or -1 if they
  * do not converge. There is at least one, since lambda itself, unrefined, costs accuracy even where it meets the tolerance.
  */
-inline DEVICE int solvePart(const Part* part, mixed dt, mixed tolerance, const Parameters* theta, LOCAL_ARG mixed* buffer) {
-    findRows(part, part->position, theta->here, part->G);
+inline DEVICE int solvePart(const Part* part, mixed guess, mixed tolerance, const Parameters* theta, LOCAL_ARG mixed* buffer) {
     findScales(part, theta->next);
     int iterations = 0, sinceGuess = 0, result = -1;
     bool isNewton = false, isGuess = true;
@@ -335,7 +407,7 @@ inline DEVICE int solvePart(const Part* part, mixed dt, mixed tolerance, const P
     KEEP_LOOP for (int i = 0; i < MAX_PART_ITERATIONS && result < 0; i++) {
         if (isGuess)
             KEEP_LOOP for (int k = THREAD; k < part->numRows; k += NUM_THREADS)
-                part->gamma[k] = -dt*dt/2*part->multipliers[k];
+                part->gamma[k] = -guess*part->multipliers[k];
         isGuess = false;
         SYNC_PIECE;
         pushParticles(part, part->gamma, 1, part->base, part->moved);
@@ -387,17 +459,51 @@ inline DEVICE int solvePart(const Part* part, mixed dt, mixed tolerance, const P
     return result;
 }
 
+#if UPDATE == LANGEVIN
+
+/**
+ * In the middle of a drift: the velocities that moved stands for get their noise, and what follows begins there. before is the way that
+ * has been gone. Returns false if constraints depend on each other there.
+ */
+inline DEVICE bool turnPart(const Part* part, mixed drift, const Parameters* theta, Noise noise, GLOBAL const int* RESTRICT atomIndex) {
+    KEEP_LOOP for (int i = THREAD; i < part->numParticles; i += NUM_THREADS) {
+        const mixed w = part->inverseMass[i];
+        mixed v[3];
+        UNROLL for (int d = 0; d < 3; d++) {
+            part->before[3*i+d] = part->moved[3*i+d];
+            part->position[3*i+d] += part->moved[3*i+d];
+            v[d] = part->moved[3*i+d]/drift;
+        }
+        if (w > 0)
+            addNoise(noise, atomIndex[part->atoms[i]], w, v);
+        UNROLL for (int d = 0; d < 3; d++)
+            part->base[3*i+d] = drift*v[d];
+    }
+    SYNC_PIECE;
+    findRows(part, part->position, theta->next, part->G);
+    formMatrix(part, part->G, part->G, true, part->pivots, part->lower, part->lower);
+    return factorizePart(part, true, part->pivots, part->lower, part->lower);
+}
+
+#endif
+
 // ------------------------------------------------------------------------------------------------------------------- the kernels
 
 #define EXPRESSION_MEMORY LOCAL mixed buffer[PIECE_SUMS];
+#if NUM_THREADS > 1
+#define MERGE_PART_SUMS(sums) mergeInGroup(sums, buffer)
+#else
+#define MERGE_PART_SUMS(sums)
+#endif
 
 /** finishStep for the parts. */
 KERNEL void finishExpressions(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
-        GLOBAL mixed* RESTRICT partials, EXPRESSION_PARAMETERS) {
+        GLOBAL mixed* RESTRICT partials, EXPRESSION_PARAMETERS LAST_STATE_PARAMETERS) {
     EXPRESSION_MEMORY
     OPEN_PARAMETERS
     const bool isFrozen = (failure[0] != 0), formHalf = (isFormed || control[IS_SHORTENED] != 0);
     const mixed dt = (mixed) control[STEP_SIZE], halfKick = (mixed) (settings[NOMINAL]/(2*control[DENSITY])), rate = 1/dt;
+    MAKE_LAST_STATE(kick, dt, isFormed)
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     // A failure elsewhere in this launch may be seen by some threads of a group, so nothing but what is written depends on it.
     KEEP_LOOP for (int i = GROUP_ID; i < numParts; i += NUM_GROUPS) {
@@ -423,9 +529,12 @@ KERNEL void finishExpressions(int step, mixed kick, int isFormed, int isStored, 
                     velm[part.atoms[j]] = make_mixed4(part.moved[3*j], part.moved[3*j+1], part.moved[3*j+2], part.inverseMass[j]);
         measurePart(&part, part.moved, &theta, theta.next, rate, force, paddedNumAtoms, sums);
         SYNC_PIECE;
+#ifdef CLUSTER_TERM_COUNT
+        isRegular = addClustersOfPart(&part, part.moved, force, paddedNumAtoms, sums, buffer LAST_STATE_ARGUMENT) && isRegular;
+#endif
         KEEP_LOOP for (int k = THREAD; k < (isFrozen ? 0 : part.numRows); k += NUM_THREADS)
             part.multipliers[k] = part.solution[k];
-        MERGE_SUMS(sums);
+        MERGE_PART_SUMS(sums);
         if (THREAD == 0 && !isFrozen)
             for (int j = 0; j < NUM_SUMS; j++)
                 partials[j*numPartials + firstPartial + i] = sums[j];
@@ -438,7 +547,7 @@ KERNEL void finishExpressions(int step, mixed kick, int isFormed, int isStored, 
         }
         SYNC_PIECE;
         measurePart(&part, part.before, &theta, theta.next, rate, force, paddedNumAtoms, halfSums);
-        MERGE_SUMS(halfSums);
+        MERGE_PART_SUMS(halfSums);
         if (THREAD == 0 && !isFrozen)
             for (int j = 0; j < NUM_SUMS; j++)
                 partials[(NUM_SUMS + j)*numPartials + firstPartial + i] = halfSums[j];
@@ -463,7 +572,8 @@ KERNEL void tryExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRIC
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = 0;
         loadPart(&part, dt, dt/2, EXPRESSION_STATE_ARGUMENTS);
-        const int iterations = solvePart(&part, dt, tolerance, &theta, buffer);
+        findRows(&part, part.position, theta.here, part.G);
+        const int iterations = solvePart(&part, dt*dt/2, tolerance, &theta, buffer);
         if (iterations >= 0) // where the next trial starts
             KEEP_LOOP for (int k = THREAD; k < part.numRows; k += NUM_THREADS)
                 part.multipliers[k] = -2*part.gamma[k]/(dt*dt);
@@ -479,7 +589,7 @@ KERNEL void tryExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRIC
         measurePart(&part, part.moved, &theta, theta.here, 1/dt, force, paddedNumAtoms, sums);
         if (iterations < 0 && THREAD == 0)
             sums[FAILURES] += 1;
-        MERGE_SUMS(sums);
+        MERGE_PART_SUMS(sums);
         if (THREAD == 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 nextPartials[j*numPartials + firstPartial + i] = sums[j];
@@ -491,14 +601,17 @@ KERNEL void tryExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRIC
 
 /** advanceStep for the parts, which takes the step size that that has found. */
 KERNEL void advanceExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities,
-        EXPRESSION_PARAMETERS) {
+        EXPRESSION_PARAMETERS LARGE_NOISE_STATE) {
     EXPRESSION_MEMORY
     OPEN_PARAMETERS
     const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
-    const mixed dt = (mixed) nextControl[STEP_SIZE], inverse = (dt > 0 ? 1/dt : (mixed) 0);
+    const mixed dt = (mixed) nextControl[STEP_SIZE], drift = (UPDATE == LANGEVIN ? dt/2 : dt), inverse = (drift > 0 ? 1/drift : (mixed) 0);
+#if UPDATE == LANGEVIN
+    const Noise noise = makeNoise(step, noiseState, settings);
+#endif
     KEEP_LOOP for (int i = (isFrozen ? numParts : GROUP_ID); i < numParts; i += NUM_GROUPS) {
         const Part part = OPEN_PART;
-        loadPart(&part, dt, dt/2, EXPRESSION_STATE_ARGUMENTS);
+        loadPart(&part, drift, dt/2, EXPRESSION_STATE_ARGUMENTS);
         KEEP_LOOP for (int j = THREAD; j < part.numParticles; j += NUM_THREADS)
             if (part.inverseMass[j] > 0) {
                 const int atom = part.atoms[j];
@@ -507,13 +620,25 @@ KERNEL void advanceExpressions(int step, mixed tolerance, GLOBAL const wide* RES
                 oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
                 oldVelocities[atom] = velm[atom];
             }
-        const int iterations = solvePart(&part, dt, tolerance, &theta, buffer);
+        findRows(&part, part.position, theta.here, part.G);
+        int iterations = solvePart(&part, dt/2*drift, tolerance, &theta, buffer);
+#if UPDATE == LANGEVIN
+        const bool isRegular = turnPart(&part, drift, &theta, noise, atomIndex);
+        const int more = solvePart(&part, 0, tolerance, &theta, buffer);
+        iterations = (iterations < 0 || more < 0 ? -1 : iterations + more);
+        if (!isRegular)
+            fail(failure, step, IRREGULAR + NUM_CODES*i);
+#endif
         KEEP_LOOP for (int j = THREAD; j < (iterations >= 0 ? part.numParticles : 0); j += NUM_THREADS)
             if (part.inverseMass[j] > 0) {
                 const int atom = part.atoms[j];
                 const mixed4 old = oldPositions[atom];
                 const mixed x = part.moved[3*j], y = part.moved[3*j+1], z = part.moved[3*j+2];
+#if UPDATE == LANGEVIN
+                storePosition(posq, posqCorrection, atom, old.x + (part.before[3*j] + x), old.y + (part.before[3*j+1] + y), old.z + (part.before[3*j+2] + z), (real) old.w);
+#else
                 storePosition(posq, posqCorrection, atom, old.x + x, old.y + y, old.z + z, (real) old.w);
+#endif
                 velm[atom] = make_mixed4(inverse*x, inverse*y, inverse*z, part.inverseMass[j]);
             }
         if (THREAD == 0) {

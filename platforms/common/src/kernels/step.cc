@@ -240,13 +240,31 @@ CLUSTER_FUNCTIONS
 #if NUM_THREADS == 1
 #define THREAD 0
 #define SYNC_PIECE
+#define ADD_IN_GROUP(numbers, count)
 #define MERGE_SUMS(sums)
 #define PIECE_SUMS 1
 #else
 #define THREAD LOCAL_ID
 #define SYNC_PIECE SYNC_THREADS
+#define ADD_IN_GROUP(numbers, count) addInGroup(numbers, count, buffer)
+
+/** Add up numbers of all threads of a work group, each of which gets the results. */
+inline DEVICE void addInGroup(mixed* numbers, const int count, LOCAL_ARG mixed* buffer) {
+    for (int j = 0; j < count; j++)
+        buffer[j*GROUP_SIZE + LOCAL_ID] = numbers[j];
+    for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
+        SYNC_THREADS;
+        if (LOCAL_ID < width)
+            for (int j = 0; j < count; j++)
+                buffer[j*GROUP_SIZE + LOCAL_ID] += buffer[j*GROUP_SIZE + LOCAL_ID + width];
+    }
+    SYNC_THREADS;
+    for (int j = 0; j < count; j++)
+        numbers[j] = buffer[j*GROUP_SIZE];
+}
+
 #if UPDATE == AUTOMATIC
-#define MERGE_SUMS(sums) addTermsInGroup(sums, buffer)
+#define MERGE_SUMS(sums) addInGroup(sums, NUM_TERMS, buffer)
 #else
 #define MERGE_SUMS(sums) mergeInGroup(sums, buffer)
 #endif
