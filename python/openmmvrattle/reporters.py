@@ -370,14 +370,15 @@ class _WithStepSize:
 
 
 def _integrator_of(simulation: app.Simulation) -> Any:
-    """The integrator that takes the steps: of a CompoundIntegrator the one that is chosen."""
+    """The integrator that takes the steps, of its own class: of a CompoundIntegrator the one that is chosen."""
     integrator = simulation.integrator
-    if not isinstance(integrator, openmm.CompoundIntegrator):
-        return integrator
-    member = with_class(integrator.getIntegrator(integrator.getCurrentIntegrator()))
-    if isinstance(member, CustomVariableStepRattleIntegrator):
-        member.attachContext(simulation.context)
-    return member
+    if isinstance(integrator, openmm.CompoundIntegrator):
+        integrator = integrator.getIntegrator(integrator.getCurrentIntegrator())
+    found = type(integrator)
+    integrator = with_class(integrator)  # OpenMM does not know the class of what it returns, or reads from XML
+    if isinstance(integrator, CustomVariableStepRattleIntegrator) and type(integrator) is not found:
+        integrator.attachContext(simulation.context)
+    return integrator
 
 
 def _monitor_values(integrator: Any) -> dict[str, float | None]:

@@ -554,3 +554,21 @@ def test_constant_temperature() -> None:
     assert row["Monitor U"] == integrator.getMonitorValue() > 0
     assert row["Force Evaluations"] == integrator.getNumForceEvaluations()
     assert row["Constraint Error"] < 1e-8
+
+
+@pytest.mark.parametrize("kind", [VariableStepRattleIntegrator, CustomVariableStepRattleIntegrator])
+def test_an_integrator_from_a_file(kind: type, tmp_path: Path) -> None:
+    """Simulation reads it, as a bare openmm.Integrator or CustomIntegrator."""
+    waters = rigid_waters(4)
+    path = tmp_path / "integrator.xml"
+    path.write_text(openmm.XmlSerializer.serialize(kind(0.001, monitors=[kind.ConstraintAndAppliedForce])))
+    simulation = app.Simulation(
+        waters.topology, waters.system, str(path), openmm.Platform.getPlatformByName("Reference")
+    )
+    simulation.context.setPositions(waters.positions)
+    simulation.context.setVelocities(waters.velocities)
+    simulation.reporters.append(reporter := StepSizeReporter(None, 1))
+    run_for_time(simulation, 0.02, every=0.01)
+    assert [row["Time (ps)"] for row in reporter.rows] == [0.01, 0.02]
+    assert all(row["Step Density"] != 1 for row in reporter.rows)
+    assert type(simulation.integrator) is kind
