@@ -187,7 +187,7 @@ def test_the_row_of_the_protein_is_that_of_its_page() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     page = (ROOT / "docs" / "proof.md").read_text(encoding="utf-8")
     what, verlet, automatic = re.search(
-        r"^\| (a piece of a protein in water: .*) \| (.*) \| (.*) \|$", readme, re.MULTILINE
+        r"^\| (a protein in water: .*) \| (.*) \| (.*) \|$", readme, re.MULTILINE
     ).groups()
 
     def measured(name: str) -> list[str]:
