@@ -1,11 +1,12 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""What a step of VariableStepRattleIntegrator costs beside a step of VerletIntegrator, on real systems.
+"""What a step of VariableStepRattleIntegrator costs beside a step of VerletIntegrator, on real systems; and with
+``--langevin`` one of VariableStepRattleLangevinIntegrator beside one of LangevinMiddleIntegrator.
 
 The integrators take turns, a few steps each, so that whatever else the machine does hits them alike; the cost is the
 ratio of neighbouring turns, its median and the range of its middle half. A table and one JSON line a ratio are printed.
 
-    python benchmarks/overhead.py [--system water-6000 ...] [--platform CPU] [--rounds 15]
+    python benchmarks/overhead.py [--langevin] [--system water-6000 ...] [--platform CPU] [--rounds 15]
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import openmm
 import rich.console
 import rich.table
 from openmm import app, unit
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide
 
-STEP = 0.001  # ps
+STEP, LANGEVIN_STEP = 0.001, 0.002  # ps
 
 
 def water(box: float) -> tuple[openmm.System, list]:
@@ -47,15 +49,30 @@ def peptide() -> tuple[openmm.System, list]:
     return system, modeller.positions
 
 
+def protein() -> tuple[openmm.System, list]:
+    """Villin in water with PME; all its bonds are fixed, which makes one cluster of its 582 atoms."""
+    pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    system = field.createSystem(
+        pdb.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9, constraints=app.AllBonds, rigidWater=True
+    )
+    return system, pdb.positions
+
+
 SYSTEMS: dict[str, Callable[[], tuple[openmm.System, list]]] = {
     "water-6000": lambda: water(3.94),
     "water-24000": lambda: water(6.25),
     "peptide-in-water": peptide,
+    "villin-all-bonds": protein,
 }
 
 
-def integrators() -> dict[str, openmm.Integrator]:
-    """Verlet at the tolerance 1e-6 of OpenMM's examples, ours at its default of 1e-8, with the default monitor."""
+def integrators(langevin: bool) -> dict[str, openmm.Integrator]:
+    """OpenMM's first, at the tolerance 1e-6 of its examples; ours at its default of 1e-8, with the default monitor."""
+    if langevin:
+        middle = openmm.LangevinMiddleIntegrator(300, 1, LANGEVIN_STEP)
+        middle.setConstraintTolerance(1e-6)
+        return {"LangevinMiddle": middle, "Langevin": VariableStepRattleLangevinIntegrator(300, 1, LANGEVIN_STEP)}
     verlet = openmm.VerletIntegrator(STEP)
     verlet.setConstraintTolerance(1e-6)
     explicit = VariableStepRattleIntegrator(STEP)
@@ -63,12 +80,13 @@ def integrators() -> dict[str, openmm.Integrator]:
     return {"Verlet": verlet, "Explicit": explicit, "SemiExplicit": VariableStepRattleIntegrator(STEP)}
 
 
-def measure(name: str, platform: str, rounds: int, steps: int, threads: int | None) -> list[dict]:
-    """The steps per second of each integrator, and the ratio of its cost to VerletIntegrator's."""
+def measure(name: str, platform: str, rounds: int, steps: int, threads: int | None, langevin: bool) -> list[dict]:
+    """The steps per second of each integrator, and the ratio of its cost to that of OpenMM's."""
     system, positions = SYSTEMS[name]()
     properties = {"Threads": str(threads)} if threads and platform == "CPU" else {}
     start = None
-    runs = integrators()
+    runs = integrators(langevin)
+    base = next(iter(runs))
     contexts = {}
     for label, integrator in runs.items():
         context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
@@ -92,7 +110,7 @@ def measure(name: str, platform: str, rounds: int, steps: int, threads: int | No
             seconds[label].append((time.perf_counter() - begin) / steps)
     results = []
     for label in runs:
-        ratios = sorted(a / b for a, b in zip(seconds[label], seconds["Verlet"], strict=True))
+        ratios = sorted(a / b for a, b in zip(seconds[label], seconds[base], strict=True))
         result = {
             "benchmark": "overhead",
             "system": name,
@@ -102,11 +120,11 @@ def measure(name: str, platform: str, rounds: int, steps: int, threads: int | No
             "integrator": label,
             "steps_per_second": 1 / statistics.median(seconds[label]),
             "ratio": statistics.median(ratios),
-            "ratio_of_best": min(seconds[label]) / min(seconds["Verlet"]),
+            "ratio_of_best": min(seconds[label]) / min(seconds[base]),
             "ratio_quarter": ratios[len(ratios) // 4],
             "ratio_three_quarters": ratios[-1 - len(ratios) // 4],
         }
-        if label != "Verlet":
+        if label != base:
             result["solver_iterations_per_step"] = runs[label].getNumSolverIterations() / (steps * (rounds + 1))
         results.append(result)
     return results
@@ -115,17 +133,20 @@ def measure(name: str, platform: str, rounds: int, steps: int, threads: int | No
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--langevin", action="store_true", help="the integrators at constant temperature")
     parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
     parser.add_argument("--platform", default="CPU")
     parser.add_argument("--threads", type=int, help="threads of the CPU platform (default: OpenMM's choice)")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--steps", type=int, default=10, help="steps in a turn")
     arguments = parser.parse_args()
-    table = rich.table.Table(title="Cost of a step beside VerletIntegrator's")
+    table = rich.table.Table(title="Cost of a step beside that of OpenMM's integrator")
     for column in ("system", "atoms", "integrator", "steps/s", "ratio", "middle half", "best/best"):
         table.add_column(column)
     for name in arguments.system:
-        for result in measure(name, arguments.platform, arguments.rounds, arguments.steps, arguments.threads):
+        for result in measure(
+            name, arguments.platform, arguments.rounds, arguments.steps, arguments.threads, arguments.langevin
+        ):
             print(json.dumps(result), flush=True)
             table.add_row(
                 name,

@@ -64,14 +64,20 @@ void LangevinDynamics::setSettings(const Settings& newSettings) {
         seed = newSettings.langevin.randomSeed;
         while (seed == 0)
             seed = osrngseed();
+        seed += (int64_t) newSettings.langevin.randomStream << 32;
         numDrawn = 0;
     }
+    const bool isStepNew = newSettings.stepSize != settings.stepSize;
     settings = newSettings;
     solver.setTolerance(settings.tolerance);
     if (settings.langevin.reference > 0)
         reference = settings.langevin.reference;
-    else if (reference > 0)
+    else if (reference > 0 && !settings.langevin.isReferenceFrozen) {
+        // The floor of smaller steps is no reference for large ones, which would be blind until it has fallen.
+        if (isStepNew)
+            reference = std::min(reference, std::max(LARGEST_START * findFloor(COLDEST), values[0]));
         reference = std::max(reference, findFloor(COLDEST));
+    }
 }
 
 void LangevinDynamics::setRandomState(const vector<double>& state) {

@@ -14,6 +14,7 @@ struct LangevinSettings {
     double temperature = 0;                // K
     double friction = 0;                   // 1/ps
     int randomSeed = 0;                    // 0: each Context has another one
+    int randomStream = 0;                  // its place in a CompoundIntegrator; each has noise of its own
     int maxDoublings = DEFAULT_DOUBLINGS;  // k_max: a step may be made of 2^k_max + 1 substeps, and of one for 0
     double reference = 0;                  // U_ref; 0 to let it follow the run
     bool isReferenceFrozen = false;        // it stays what it is

@@ -5,6 +5,7 @@
 #include "ExpressionCheck.h"
 #include "MaxwellVelocities.h"
 #include "SystemCheck.h"
+#include "openmm/CompoundIntegrator.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
 #include "openmm/internal/ContextImpl.h"
@@ -50,6 +51,15 @@ void checkOpenMMVersion(const string& name) {
     if (majorMinor(running) != built)
         throw OpenMMException(name + ": this plugin was built for OpenMM " + built + " and cannot run with OpenMM " +
                               running + "; install openmm==" + built + ".* or rebuild the plugin");
+}
+
+// Which one of a CompoundIntegrator it is; 0 where it is alone.
+int findPlace(const OpenMM::Integrator& integrator, OpenMM::Integrator& all) {
+    auto* compound = dynamic_cast<OpenMM::CompoundIntegrator*>(&all);
+    for (int i = 0; compound != nullptr && i < compound->getNumIntegrators(); i++)
+        if (&compound->getIntegrator(i) == &integrator)
+            return i;
+    return 0;
 }
 
 // Whether a System has a constraint that could move anything, of its own or by expression.
@@ -281,6 +291,8 @@ void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {
     requireSuitableSystem(contextRef, settings->expressions, getName());
     const OpenMM::System& system = contextRef.getSystem();
     settings->fitDefaultMonitor(hasConstraints(system, *settings));
+    if (settings->langevin)
+        settings->langevin->randomStream = findPlace(*this, contextRef.getIntegrator());
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
     RunDevice& device = created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef, *this, *settings);
     run = std::make_unique<IntegratorRun>(device, *settings, system.getNumParticles(),
@@ -331,6 +343,8 @@ void ConstrainedIntegrator::resume(const IntegratorSettings& saved, RunState& st
     const IntegratorSettings previous = *settings;
     IntegratorSettings next = saved;
     next.automaticRequest = previous.automaticRequest;
+    if (next.langevin)
+        next.langevin->randomStream = previous.langevin->randomStream;
     if (!next.hasSameConstraints(previous)) // the constraints are those of the Context, their parameters the saved ones
         next.expressions = previous.expressions;
     next.fitDefaultMonitor(hasConstraints(context->getSystem(), next));

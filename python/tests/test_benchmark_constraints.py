@@ -37,9 +37,13 @@ def test_constraints() -> None:
             assert result["their_achieved"] <= result["error"]
 
 
-def test_overhead() -> None:
-    results = run("overhead.py", "--system", "peptide-in-water", "--rounds", "1", "--steps", "1")
-    assert [r["integrator"] for r in results] == ["Verlet", "Explicit", "SemiExplicit"]
+@pytest.mark.parametrize(
+    ("options", "integrators"),
+    [([], ["Verlet", "Explicit", "SemiExplicit"]), (["--langevin"], ["LangevinMiddle", "Langevin"])],
+)
+def test_overhead(options: list[str], integrators: list[str]) -> None:
+    results = run("overhead.py", "--system", "peptide-in-water", "--rounds", "1", "--steps", "1", *options)
+    assert [r["integrator"] for r in results] == integrators
     for result in results:
         assert result["ratio"] == pytest.approx(result["ratio_of_best"])  # of one round
         assert result["steps_per_second"] > 0

@@ -553,6 +553,38 @@ def test_compound_integrator() -> None:
     assert constraint_error(system, q) < 1e-5
 
 
+def test_integrators_of_a_compound_have_noise_of_their_own() -> None:
+    """With the same seed too: else two that take turns would use each number twice, and heat."""
+    system, positions = molecules()
+    compound = openmm.CompoundIntegrator()
+    for _ in range(2):
+        compound.addIntegrator(Langevin(300, 5, 0.004, randomNumberSeed=7))
+    context = open_context(system, compound, positions)
+    start = context.getState(positions=True, velocities=True)
+    ends = []
+    for i in (0, 1):
+        context.setState(start)
+        compound.setCurrentIntegrator(i)
+        compound.step(1)
+        ends.append(state_of(context)[0])
+        assert Langevin.cast(compound.getIntegrator(i)).getRandomNumberSeed() == 7
+    assert np.max(np.abs(ends[0] - ends[1])) > 1e-5
+    alone = open_context(copy.deepcopy(system), Langevin(300, 5, 0.004, randomNumberSeed=7), positions)
+    alone.setState(start)
+    alone.getIntegrator().step(1)
+    assert np.array_equal(state_of(alone)[0], ends[0])
+    # A checkpoint knows which number is next for each.
+    checkpoint = context.createCheckpoint()
+    ends = []
+    for _ in range(2):
+        context.loadCheckpoint(checkpoint)
+        for i in (0, 1, 1, 0):
+            compound.setCurrentIntegrator(i)
+            compound.step(1)
+        ends.append(state_of(context)[0])
+    assert np.array_equal(ends[0], ends[1])
+
+
 def test_force_groups() -> None:
     """Without a group its forces do not act."""
     system, positions = molecules()
@@ -671,3 +703,21 @@ def test_the_reference_is_set_kept_and_let_go() -> None:
     assert integrator.getReferenceMonitorValue() == pytest.approx(2 * found, rel=0.0021)
     assert integrator.getReferenceMonitorValue() != 2 * found
     assert context.getStepCount() == 8
+
+
+def test_the_reference_of_small_steps_is_not_that_of_large_ones() -> None:
+    """It was the floor, which is far above what is calm for large steps; and would take a thousand of them to fall."""
+    context, integrator = make_context(setStepSize=1e-5)
+    integrator.step(10)
+    small = integrator.getReferenceMonitorValue()
+    integrator.setStepSize(0.004)
+    integrator.step(1)
+    floor = 0.5 * np.sqrt(300 * BOLTZMANN) / 0.004
+    assert small == pytest.approx(400 * floor)
+    assert integrator.getReferenceMonitorValue() < 1.01 * max(4 * floor, integrator.getMonitorValue()) < small / 2
+    # Where it is frozen it stays.
+    frozen = integrator.getReferenceMonitorValue()
+    integrator.freezeReference(True)
+    integrator.setStepSize(1e-5)
+    integrator.step(1)
+    assert integrator.getReferenceMonitorValue() == frozen
