@@ -594,10 +594,15 @@ void ConstraintSolver::guess(const Trial& trial, const Guess& guess) {
 }
 
 void ConstraintSolver::guess(const Trial& trial, const Guess& guess, int first, int end) const {
-    const double *from = guess.multipliers.data(), *offset = guess.offset != nullptr ? guess.offset->data() : nullptr;
+    const double* from = guess.multipliers.data();
     double* to = trial.multipliers.data();
+    if (guess.offset == nullptr) {
+        std::copy(from + first, from + end, to + first);
+        return;
+    }
+    const double *found = guess.offset->found.data(), *expected = guess.offset->expected.data();
     for (int k = first; k < end; k++)
-        to[k] = offset != nullptr ? from[k] + offset[k] : from[k];
+        to[k] = from[k] + (found[k] - expected[k]);
 }
 
 double ConstraintSolver::coupledPass(const Trial& trial, const Coupled& coupled, const Guess* start,

@@ -135,6 +135,14 @@ public:
                    : *std::max_element(rangeResults.begin(), rangeResults.begin() + SharedWork::getNumRanges(count));
     }
 
+    /** The sum of weight x^2 over the particles with mass. */
+    double sumOfSquares(const Vectors& x, const std::vector<double>& weights) {
+        return sum((int) movingParticles.size(), [&](int p) {
+            const int i = movingParticles[p];
+            return weights[i] * x[i].dot(x[i]);
+        });
+    }
+
     // ------------------------------------------------------------------------------------- at the positions of a step
 
     /**
@@ -172,10 +180,14 @@ public:
         Vectors &positions, &velocities; // q+ and w+
         std::vector<double>& multipliers; // lambda
     };
+    /** What an iteration has found for lambda, and what there was to expect. */
+    struct Offset {
+        std::vector<double> found, expected;
+    };
     /** Where the iteration for lambda begins, and where it ends. */
     struct Guess {
         const std::vector<double>& multipliers;
-        const std::vector<double>* offset; // is added to them; or null
+        const Offset* offset; // of another step, found - expected, is added to them; or null
         double
             margin; // the fraction of the tolerance that is aimed at; where rounding forbids it, the tolerance itself will do
     };

@@ -460,5 +460,5 @@ bool HostRunDevice<Method>::resume(const RunState& run, const IntegratorSettings
     return true;
 }
 
-template class OpenMMVRattle::HostRunDevice<VRattleDynamics>;
+template class OpenMMVRattle::HostRunDevice<VRattleRun>;
 template class OpenMMVRattle::HostRunDevice<LangevinDynamics>;

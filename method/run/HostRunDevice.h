@@ -27,7 +27,7 @@ namespace OpenMMVRattle {
  *         ... compute the forces there ...
  *     } while (!method.finish(forces, groupEnergy));         // the step is complete: new positions, velocities, forces
  *
- * Until finish() has returned true, the state before the step is untouched. What else there is to a method: VRattleDynamics.
+ * Until finish() has returned true, the state before the step is untouched. What else there is to a method: VRattleRun.
  */
 template <class Method> class HostRunDevice : public RunDevice {
 public:

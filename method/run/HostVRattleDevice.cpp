@@ -17,7 +17,7 @@ HostVRattleDevice::HostVRattleDevice(std::unique_ptr<ContextVectors> vectors, co
 }
 
 void HostVRattleDevice::setMethod(const IntegratorSettings& from) {
-    VRattleDynamics::Settings to;
+    StepSettings to;
     to.stepSize = from.stepSize;
     to.minimumStep = from.stepSize > 0 ? from.getMinimumStep() : 0.0;
     to.maximumStep = from.stepSize > 0 ? from.getMaximumStep() : 0.0;
@@ -43,7 +43,7 @@ void HostVRattleDevice::setMethod(const IntegratorSettings& from) {
 void HostVRattleDevice::beginTrial(double stepSize, bool isBackwards) {
     const double direction = isBackwards ? -1 : 1;
     trial.reset(new Trial{vrattle.keep(), vectors->getTime(), direction});
-    VRattleDynamics::Settings fixed = settings;
+    StepSettings fixed = settings;
     fixed.isFixedStep = true;
     fixed.stepSize = stepSize;
     Vectors velocities = vrattle.getVelocities();
@@ -106,16 +106,16 @@ long long HostVRattleDevice::getNumShortSteps() {
 
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
-void HostVRattleDevice::exchange(VRattleDynamics::Memory& memory, RunState::Archive archive, size_t numMonitors,
+void HostVRattleDevice::exchange(StepState& state, StepMemory& memory, RunState::Archive archive, size_t numMonitors,
                                  bool isAutomatic) const {
-    const ConstraintSystem& constraints = vrattle.getConstraintSystem();
+    const size_t numConstraints = state.lambda.size(), numParameters = state.theta.values.size();
     archive.add("hasDensity", memory.hasDensity);
-    archive.add("density", memory.density);
-    archive.add("parameters", memory.parameters, constraints.getNumParameters());
-    archive.add("parameterRates", memory.parameterRates, constraints.getNumParameters());
-    archive.add("multiplierOffset", memory.multiplierOffset, constraints.getNumConstraints());
-    archive.add("multipliers", memory.multipliers, constraints.getNumConstraints());
-    archive.add("monitorValues", memory.monitorValues, numMonitors);
+    archive.add("density", memory.rho);
+    archive.add("parameters", state.theta.values, numParameters);
+    archive.add("parameterRates", state.theta.rates, numParameters);
+    archive.add("multiplierOffset", state.offset.found, numConstraints);
+    archive.add("multipliers", state.lambda, numConstraints);
+    archive.add("monitorValues", memory.values, numMonitors);
     archive.add("hasHalfStepValue", memory.hasHalfStepValue);
     archive.add("u", memory.u);
     archive.add("halfStepValue", memory.halfStepValue);
@@ -144,24 +144,36 @@ void HostVRattleDevice::exchange(VRattleDynamics::Memory& memory, RunState::Arch
 }
 
 void HostVRattleDevice::saveMethod(RunState& run) {
-    VRattleDynamics::Memory memory = vrattle.getMemory();
-    run.halfStepVelocities = memory.halfStepVelocities;
-    exchange(memory, RunState::Archive(run), memory.monitorValues.size(), settings.isAutomatic);
+    VRattleRun::Kept kept = vrattle.keep();
+    run.halfStepVelocities = kept.state.w;
+    for (size_t k = 0; k < kept.state.lambda.size(); k++) // the difference is all that counts
+        kept.state.offset.found[k] -= kept.state.offset.expected[k];
+    exchange(kept.state, kept.memory, RunState::Archive(run), kept.memory.values.size(), settings.isAutomatic);
 }
 
-VRattleDynamics::Memory HostVRattleDevice::memoryOf(const RunState& run, const IntegratorSettings& saved) const {
-    VRattleDynamics::Memory memory = {};
-    memory.halfStepVelocities = run.halfStepVelocities;
+void HostVRattleDevice::read(const RunState& run, const IntegratorSettings& saved, StepState& state,
+                             StepMemory& memory) const {
+    exchange(state, memory, RunState::Archive(run), saved.monitors.size(), saved.isAutomatic);
+    const vector<double>& rates = state.theta.rates;
+    state.theta.isMoving = std::any_of(rates.begin(), rates.end(), [](double rate) { return rate != 0; });
+    state.w = run.halfStepVelocities;
     memory.references = run.references;
-    exchange(memory, RunState::Archive(run), saved.monitors.size(), saved.isAutomatic);
-    return memory;
 }
 
 bool HostVRattleDevice::canResume(const RunState& run, const IntegratorSettings& saved) {
-    memoryOf(run, saved);
-    return run.halfStepVelocities.size() == masses.size();
+    StepState state(vrattle.getConstraintSystem());
+    StepMemory memory;
+    read(run, saved, state, memory);
+    return state.w.size() == masses.size();
 }
 
-void HostVRattleDevice::resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) {
-    vrattle.resume(state.positions, state.velocities, state.forces, state.groupEnergy, memoryOf(run, saved));
+void HostVRattleDevice::resumeMethod(const State& from, const RunState& run, const IntegratorSettings& saved) {
+    StepState state(vrattle.getConstraintSystem());
+    StepMemory memory;
+    read(run, saved, state, memory);
+    state.q = from.positions;
+    state.v = from.velocities;
+    state.force = from.forces;
+    state.groupEnergy = from.groupEnergy;
+    vrattle.resume(state, memory);
 }

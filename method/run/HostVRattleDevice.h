@@ -6,14 +6,14 @@
 
 #include "run/HostRunDevice.h"
 #include "run/RunState.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <memory>
 #include <vector>
 
 namespace OpenMMVRattle {
 
-/** The device of VariableStepRattleIntegrator: the method is VRattleDynamics. */
-class HostVRattleDevice : public HostRunDevice<VRattleDynamics> {
+/** The device of VariableStepRattleIntegrator: the method is VRattleRun. */
+class HostVRattleDevice : public HostRunDevice<VRattleRun> {
 public:
     HostVRattleDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
                       const IntegratorSettings& settings);
@@ -32,14 +32,14 @@ protected:
     void setMethod(const IntegratorSettings& settings) override;
     void saveMethod(RunState& run) override;
     void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) override;
-    void exchange(VRattleDynamics::Memory& memory, RunState::Archive archive, size_t numMonitors,
+    void exchange(StepState& state, StepMemory& memory, RunState::Archive archive, size_t numMonitors,
                   bool isAutomatic) const;
-    VRattleDynamics::Memory memoryOf(const RunState& run, const IntegratorSettings& saved) const;
-    VRattleDynamics& vrattle = method;
-    VRattleDynamics::Settings settings;
+    void read(const RunState& run, const IntegratorSettings& saved, StepState& state, StepMemory& memory) const;
+    VRattleRun& vrattle = method;
+    StepSettings settings;
     /** A trial run, and what is to be put back after it. */
     struct Trial {
-        VRattleDynamics::Kept kept;
+        VRattleRun::Kept kept;
         double time, direction;
     };
     std::unique_ptr<Trial> trial;

@@ -12,31 +12,39 @@ using OpenMM::Vec3;
 using std::vector;
 
 AutomaticSteps::AutomaticSteps(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
-        StepControl(constraints, solver, now), control(constraints), mustForget(false), mustBegin(false),
-        isStartedNow(false), isJump(false), memoryBefore(), forcesAhead(nullptr),
-        blockSums(constraints.getSystem().getBlocks().size() - 1) {
+        StepControl(constraints, solver, now), control(constraints), isStartedNow(false), isJump(false), memoryBefore(),
+        forcesAhead(nullptr), blockSums(constraints.getSystem().getBlocks().size() - 1) {
 }
 
-AutomaticControl::State AutomaticSteps::stateOf(const StepState& state, const vector<Vec3>& forces) const {
-    return {state.q, state.theta, state.v, forces, state.lambda};
+AutomaticControl::State AutomaticSteps::stateOf(const StepState& state) {
+    return {state.q, state.theta, state.v, state.force, state.lambda};
 }
 
 // A reference of 0 stands for the one in force, if it is still.
-bool AutomaticSteps::setSettings(const StepSettings& next, bool isInForce) {
-    mustBegin = false;
+bool AutomaticSteps::setSettings(const StepSettings& newSettings, bool isInForce) {
+    bool mustBegin = !isInForce;
     for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++) {
-        const double given = next.automaticReferences[k], old = control.getReference(k);
-        const bool isKept =
-            isInForce && settings.automaticReferences[k] == 0 && next.automaticRequest == settings.automaticRequest;
+        const double given = newSettings.automaticReferences[k], old = control.getReference(k);
+        const bool isKept = isInForce && settings.automaticReferences[k] == 0 &&
+                            newSettings.automaticRequest == settings.automaticRequest;
         const double reference = given == 0 && isKept ? old : given;
         mustBegin = mustBegin || reference != old;
         control.setReference(k, reference);
     }
-    mustBegin = mustBegin || !isInForce;
-    mustForget = mustBegin || next.isFixedStep != settings.isFixedStep;
-    const bool goesOn = !mustForget && next.stepSize == settings.stepSize && next.minimumStep == settings.minimumStep;
-    applySettings(next);
-    return goesOn;
+    const bool mustForget = mustBegin || newSettings.isFixedStep != settings.isFixedStep;
+    const bool goesOn =
+        !mustForget && newSettings.stepSize == settings.stepSize && newSettings.minimumStep == settings.minimumStep;
+    applySettings(newSettings);
+    if (goesOn || now.q.empty())
+        return true;
+    if (mustBegin)
+        control.begin(stateOf(now));
+    takeValues();
+    if (mustForget)
+        forgetDensity();
+    if (hasDensity)
+        rho = control.getLast(); // which the bound may have changed
+    return false;
 }
 
 void AutomaticSteps::applySettings(const StepSettings& newSettings) {
@@ -49,43 +57,33 @@ void AutomaticSteps::applySettings(const StepSettings& newSettings) {
     control.setSettings(own);
 }
 
-void AutomaticSteps::changeSettings() {
-    if (mustBegin)
-        control.begin(stateOf(now, now.force));
-    takeValues();
-    if (mustForget)
-        forgetDensity();
-    if (hasDensity)
-        rho = control.getLast(); // which the bound may have changed
-}
-
 vector<double> AutomaticSteps::getReferences() const {
-    vector<double> references;
+    vector<double> inForce;
     for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
-        references.push_back(control.getReference(k));
-    return references;
+        inForce.push_back(control.getReference(k));
+    return inForce;
 }
 
-void AutomaticSteps::setReferences(const vector<double>& references) {
-    for (size_t k = 0; k < references.size(); k++)
-        control.setReference((int) k, references[k]);
+void AutomaticSteps::setReferences(const vector<double>& newReferences) {
+    for (size_t k = 0; k < newReferences.size(); k++)
+        control.setReference((int) k, newReferences[k]);
 }
 
-void AutomaticSteps::getMemory(StepMemory& memory) const {
-    memory.hasDensity = hasDensity;
-    memory.density = rho;
+StepMemory AutomaticSteps::getMemory() const {
+    StepMemory memory = *this;
     memory.references = getReferences();
-    memory.u = 1;
     memory.automatic = control.getMemory();
+    memory.values.clear(); // which are those of the numbers
+    return memory;
 }
 
 void AutomaticSteps::setMemory(const StepSettings& newSettings, const StepMemory& memory) {
+    hasDensity = memory.hasDensity;
+    rho = memory.rho;
     applySettings(newSettings);
     setReferences(memory.references);
     control.setMemory(memory.automatic);
     takeValues();
-    hasDensity = memory.hasDensity;
-    rho = memory.density;
 }
 
 void AutomaticSteps::takeValues() {
@@ -97,19 +95,19 @@ void AutomaticSteps::takeValues() {
 void AutomaticSteps::begin() {
     forgetDensity();
     requireFiniteForces(now.force);
-    control.begin(stateOf(now, now.force));
+    control.begin(stateOf(now));
     takeValues();
 }
 
-void AutomaticSteps::adopt(double density, const AutomaticRecursions::AutomaticNumbers& numbers,
-                           const vector<double>& references) {
-    AutomaticControl::Memory memory = control.getMemory(); // with S_c
-    static_cast<AutomaticRecursions::AutomaticNumbers&>(memory) = numbers;
-    control.setMemory(memory);
-    setReferences(references);
+// With S_c of begin().
+void AutomaticSteps::adopt(const StepMemory& memory) {
+    AutomaticControl::Memory own = control.getMemory();
+    static_cast<AutomaticRecursions::AutomaticNumbers&>(own) = memory.automatic;
+    control.setMemory(own);
+    setReferences(memory.references);
     takeValues();
     hasDensity = true;
-    rho = density;
+    rho = memory.rho;
 }
 
 void AutomaticSteps::change(ChangeKind kind, double part) {
@@ -120,7 +118,7 @@ void AutomaticSteps::change(ChangeKind kind, double part) {
     }
     if (isPlace)
         requireFiniteForces(now.force);
-    control.change(stateOf(now, now.force), part);
+    control.change(stateOf(now), part);
     takeValues();
     if (isPlace) // else the kick of the last step is in the half-step momentum
         rho = control.getLast();
@@ -159,13 +157,9 @@ bool AutomaticSteps::start() {
     return true;
 }
 
-void AutomaticSteps::findFirstDensity() {
-    rhoNext = 1;
-}
-
 void AutomaticSteps::solve() {
-    rhoNext = settings.isFixedStep ? 1.0 : control.getNext();
-    if (!solver.solve(rho, rhoNext))
+    rhoNext = settings.isFixedStep || !hasDensity ? 1.0 : control.getNext();
+    if (hasDensity && !solver.solve(rho, rhoNext))
         throwNotConverged();
 }
 
@@ -204,29 +198,27 @@ void AutomaticSteps::requireFiniteForces(const vector<Vec3>& forces) {
             throw StepFailure("the force on a particle is infinite or not a number");
 }
 
-bool AutomaticSteps::measure(const End& end) {
-    requireFiniteForces(end.forces);
-    control.measure(stateOf(end.state, end.forces), end.state.w, end.size, now.force);
+bool AutomaticSteps::measure() {
+    const StepState& next = solver.next;
+    requireFiniteForces(next.force);
+    control.measure(stateOf(next), next.w, solver.size, now.force);
     return true;
 }
 
-void AutomaticSteps::accept(const End& end) {
+void AutomaticSteps::accept() {
     if (settings.isFixedStep || !hasDensity)
         control.acceptMeasured();
-    else if (end.kind == Regular)
+    else if (solver.kind == StepSolver::Regular)
         control.acceptStep();
     else {
-        control.acceptPartOfStep(std::min(1.0, end.size * control.getNext() / settings.stepSize));
+        control.acceptPartOfStep(std::min(1.0, solver.size * control.getNext() / settings.stepSize));
         rhoNext = control.getLast();
     }
-}
-
-void AutomaticSteps::settle(StepKind kind) {
-    hasDensity = hasDensity || kind == First;
+    hasDensity = hasDensity || solver.kind == StepSolver::First;
     if (hasDensity)
         rho = rhoNext;
     if (hasDensity && isJump)
-        control.change(stateOf(now, now.force), 1.0);
+        control.change(stateOf(now), 1.0);
     takeValues();
 }
 

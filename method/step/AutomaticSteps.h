@@ -23,37 +23,31 @@ public:
     void setReferenceTemperature(double kT) {
         control.setReferenceTemperature(kT);
     }
-    bool setSettings(const StepSettings& settings, bool isInForce) override;
-    void changeSettings() override;
-    void getMemory(StepMemory& memory) const override;
-    void setMemory(const StepSettings& settings, const StepMemory& memory) override;
+    bool setSettings(const StepSettings& newSettings, bool isInForce) override;
+    StepMemory getMemory() const override;
+    void setMemory(const StepSettings& newSettings, const StepMemory& memory) override;
     void begin() override;
-    /** Go on after begin() with the numbers and references of somebody else's steps, which have led here. */
-    void adopt(double density, const AutomaticRecursions::AutomaticNumbers& numbers,
-               const std::vector<double>& references);
+    void adopt(const StepMemory& memory) override;
     void change(ChangeKind kind, double part) override;
     void reverse() override;
     void prepare() override;
     bool isVariable() const override;
     void jump(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& theta, bool isLarge) override;
     bool start() override;
-    void findFirstDensity() override;
     void solve() override;
     ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) override;
-    bool measure(const End& end) override;
-    void accept(const End& end) override;
-    void settle(StepKind kind) override;
+    bool measure() override;
+    void accept() override;
     void abandon() override;
 
 private:
     std::string explainStep() const override;
     void seeParticles(int block) override;
-    AutomaticControl::State stateOf(const StepState& state, const std::vector<OpenMM::Vec3>& forces) const;
+    static AutomaticControl::State stateOf(const StepState& state);
     void applySettings(const StepSettings& newSettings);
     void requireFiniteForces(const std::vector<OpenMM::Vec3>& forces);
     void takeValues();
     AutomaticControl control;
-    bool mustForget, mustBegin;               // for the sake of new settings
     bool isStartedNow;                        // by the step in progress
     bool isJump;                              // whether the velocities are about to jump
     AutomaticControl::Memory memoryBefore;    // a start

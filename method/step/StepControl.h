@@ -6,50 +6,63 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
+#include "step/AutomaticControl.h"
 #include "step/StepSolver.h"
-#include "step/StepState.h"
 #include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
 
+/** What a user can choose. */
+struct StepSettings {
+    double stepSize;                      // the nominal step h (ps)
+    double minimumStep, maximumStep;      // bounds (ps), 0 for none
+    double tolerance;                     // of the constraints, relative
+    StepDensity::Update update;
+    std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
+    bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
+    // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
+    bool isAutomatic = false;
+    double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
+    int automaticRequest = 0; // changes when references in force are to be forgotten
+    int calibrationSteps = 1; // how many steps the references are found from
+};
+
+/** What the density of the next step depends on, beside the settings and the state. */
+struct StepMemory {
+    bool hasDensity = false; // else the next step is the first one
+    double rho = 1; // rho[n-1/2]
+    std::vector<double> values, references; // U_k(q[n],p[n]); U_k,ref in force
+    double u = 1, halfStepValue = 0; // u(q[n],p[n]), u(q[n],p[n-1/2])
+    bool hasHalfStepValue = false;
+    double rate = 0; // the change of u along F - G^T Lambda; only the speed of convergence depends on it
+    double densityOffset = 0; // what (3.14) and (3.15) differed by in the last step
+    AutomaticControl::Memory automatic; // of automatic step control
+};
+
 /**
  * What decides on the density rho of the steps, dt = stepSize/rho: from what it sees of the states it keeps rho[n-1/2] and what else
  * rho[n+1/2] follows from. It is told of all that happens to the state, which is the one that the StepSolver goes from.
  */
-class StepControl {
+class StepControl : protected StepMemory {
 public:
-    enum StepKind { Regular, First, Shortened };
     /** What has been changed between two steps. */
     enum ChangeKind { Everything, Forces, Velocities, Frame };
-    /** A step has come to its end. */
-    struct End {
-        const StepState& state;
-        const std::vector<OpenMM::Vec3>& forces; // those there, which are not in the state yet
-        double groupEnergy;
-        const ConstraintSolver::HalfStep* atHalfStep; // or null
-        StepKind kind;
-        double size; // ps
-    };
 
     StepControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
-            constraints(constraints), solver(solver), now(now), settings(), hasDensity(false), rho(1), rhoNext(1) {
+            constraints(constraints), solver(solver), now(now), settings(), rhoNext(1) {
     }
-    virtual ~StepControl() {
-    }
-    /** Whether the next step continues a sequence of densities; if not, it is the first one. */
+    virtual ~StepControl() = default;
     bool hasStarted() const {
         return hasDensity;
     }
-    /** rho[n-1/2] */
+    /** rho[n-1/2], and rho[n+1/2] of the step in progress */
     double getDensity() const {
         return rho;
     }
-    /** rho[n+1/2] of the step in progress */
     double getNextDensity() const {
         return rhoNext;
     }
-    /** U_k at the state */
     const std::vector<double>& getValues() const {
         return values;
     }
@@ -60,16 +73,14 @@ public:
         return 0;
     }
     /**
-     * Take over settings.
+     * Take over settings. Where there is a state, the densities go on from there if the new settings allow it.
      *
      * @param isInForce    whether this control has been in force so far
-     * @return whether the densities go on as if nothing had happened; if not, changeSettings() has to follow where there is a state
+     * @return whether everything goes on as if nothing had happened; if not, the half-step momentum is formed anew
      */
-    virtual bool setSettings(const StepSettings& settings, bool isInForce) = 0;
-    virtual void changeSettings() = 0;
-    /** What the following steps depend on. */
-    virtual void getMemory(StepMemory& memory) const = 0;
-    virtual void setMemory(const StepSettings& settings, const StepMemory& memory) = 0;
+    virtual bool setSettings(const StepSettings& newSettings, bool isInForce) = 0;
+    virtual StepMemory getMemory() const = 0;
+    virtual void setMemory(const StepSettings& newSettings, const StepMemory& memory) = 0;
 
     /**
      * The state is one that no step has led to: there is no density.
@@ -77,6 +88,8 @@ public:
      * @throws StepFailure    if a monitor is not defined there
      */
     virtual void begin() = 0;
+    /** After that: go on in the middle of a sequence that somebody else's steps have led to, with what the memory has of it. */
+    virtual void adopt(const StepMemory& memory) = 0;
     /**
      * The state has changed between two steps. But for a change of the velocities the half-step momentum is formed anew afterwards.
      *
@@ -93,14 +106,13 @@ public:
     virtual bool isVariable() const = 0;
     /** The velocities will jump to these in the step, since parameters of expressions begin to move, or stop. */
     virtual void jump(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& theta, bool isLarge) = 0;
-    /** Start a sequence of densities without looking ahead; returns whether that is done. */
+    /** Where there is no sequence of densities yet, start one without looking ahead; returns whether that is done. */
     virtual bool start() {
         return false;
     }
-    /** Else find rho[1/2] of the first step, which is one of plain RATTLE from the on-step state. */
-    virtual void findFirstDensity() = 0;
     /**
-     * Find rho[n+1/2], and solve the equations of the step with it.
+     * Find rho[n+1/2], and solve the equations of the step with it; but rho[1/2] alone for a first step, which is one of plain
+     * RATTLE from the on-step state.
      *
      * @throws StepFailure    if they have no solution that the iteration finds
      */
@@ -108,14 +120,11 @@ public:
     [[noreturn]] void throwNotConverged() {
         throw StepFailure(solver.explainFailure() + explainStep());
     }
-    /** Whether the multipliers at half-step velocities are wanted at the end of a step. */
-    virtual bool needsHalfStep() const {
-        return false;
+    /** The forces at the end of the step in progress are known: where to put the multipliers at half-step velocities, or null. */
+    virtual ConstraintSolver::HalfStep* lookBack() {
+        return nullptr;
     }
-    /** Where the forces at the end of a step are known, look back from its start if it is a first one. */
-    virtual void lookBack(const std::vector<OpenMM::Vec3>&, double, StepKind, double) {
-    }
-    /** What is to be done along with the solution at its end. */
+    /** What is to be done along with the solution there. */
     virtual ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) = 0;
     /**
      * Look at the end of the step; nothing is taken over.
@@ -123,10 +132,9 @@ public:
      * @return whether the step stands; if not, the first density is now known better
      * @throws StepFailure    if a monitor is not defined there
      */
-    virtual bool measure(const End& end) = 0;
-    /** Take over what has been measured, before the state becomes that of the end, and afterwards. */
-    virtual void accept(const End& end) = 0;
-    virtual void settle(StepKind kind) = 0;
+    virtual bool measure() = 0;
+    /** Take over what has been measured: the state is that of the end now. */
+    virtual void accept() = 0;
     /** Or the step has failed. */
     virtual void abandon() = 0;
 
@@ -141,9 +149,7 @@ protected:
     StepSolver& solver;
     const StepState& now;
     StepSettings settings;
-    bool hasDensity;
-    double rho, rhoNext; // rho[n-1/2], rho[n+1/2]
-    std::vector<double> values; // U_k
+    double rhoNext; // rho[n+1/2]
 };
 
 } // namespace OpenMMVRattle

@@ -3,6 +3,7 @@
 
 #include "step/StepMonitor.h"
 #include <algorithm>
+#include <cmath>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -24,37 +25,24 @@ struct Parts {
     }
 };
 
-Parts partsOf(StepMonitor::Kind kind) {
-    switch (kind) {
-    case StepMonitor::ConstraintMultipliers: // (4.4)
-        return {Square, false, true, No, No};
-    case StepMonitor::ConstraintForce:
-        return {Square, true, false, No, No};
-    case StepMonitor::AppliedForce:
-        return {Square, false, false, OverMass, No};
-    case StepMonitor::ConstraintAndAppliedForce:
-        return {Square, true, false, OverMass, No};
-    case StepMonitor::MultiplierPNorm:
-        return {Power, false, true, No, No};
-    case StepMonitor::ForcePNorm:
-        return {Power, false, false, One, No};
-    case StepMonitor::VectorField: // (4.1)
-        return {Square, false, false, One, Mass};
-    case StepMonitor::MaxForce:
-        return {Largest, false, false, One, No};
-    case StepMonitor::ArcLength:
-        return {Square, false, false, One, One};
-    case StepMonitor::MaxParticleArcLength:
-        return {Largest, false, false, One, One};
-    case StepMonitor::ForceGroupEnergy:
-        break;
-    }
-    return {Energy, false, false, No, No};
-}
+// In the order of StepMonitor::Kind.
+const Parts PARTS[] = {
+    {Square, false, true, No, No},        // ConstraintMultipliers (4.4)
+    {Square, true, false, No, No},        // ConstraintForce
+    {Square, false, false, OverMass, No}, // AppliedForce
+    {Square, true, false, OverMass, No},  // ConstraintAndAppliedForce
+    {Power, false, true, No, No},         // MultiplierPNorm
+    {Power, false, false, One, No},       // ForcePNorm
+    {Square, false, false, One, Mass},    // VectorField (4.1)
+    {Largest, false, false, One, No},     // MaxForce
+    {Square, false, false, One, One},     // ArcLength
+    {Largest, false, false, One, One},    // MaxParticleArcLength
+    {Energy, false, false, No, No},       // ForceGroupEnergy
+};
 
 bool anyOf(const vector<StepMonitor::Term>& terms, bool (*isWanted)(const Parts&)) {
     return std::any_of(terms.begin(), terms.end(),
-                       [&](const StepMonitor::Term& term) { return isWanted(partsOf(term.kind)); });
+                       [&](const StepMonitor::Term& term) { return isWanted(PARTS[term.kind]); });
 }
 
 double total(const vector<double>& parts) {
@@ -65,18 +53,30 @@ double total(const vector<double>& parts) {
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
         solver(solver), system(solver.getSystem()), forces(nullptr), groupEnergy(0), forceSquared(0),
-        appliedForceSquared(0), constraintForceSquared(0), multipliersSquared(0),
-        blockSums(system.getBlocks().size() - 1), blockAppliedSums(blockSums.size()),
-        toSolve(system.getNumConstraints()), solved(system.getNumConstraints()) {
+        appliedForceSquared(0), seenForces(nullptr), seenMultipliers(nullptr), seenRightSide(nullptr),
+        seenHalf(nullptr), blockSums(system.getBlocks().size() - 1), blockAppliedSums(blockSums),
+        sums{vector<double>(solver.getNumRanges()), vector<double>(solver.getNumRanges())}, halfSums(sums),
+        toSolve(system.getNumConstraints()), solved(toSolve) {
+    trial = {toSolve, toSolve};
 }
 
-void StepMonitor::setTerms(const vector<Term>& newTerms) {
-    // Where only references or powers are others, what is known of the forces is still so.
-    const bool areLike = std::equal(newTerms.begin(), newTerms.end(), terms.begin(), terms.end(),
-                                    [](const Term& a, const Term& b) { return a.isLike(b); });
+void StepMonitor::setTerms(const vector<Term>& newTerms, const StepDensity& newBounds) {
     terms = newTerms;
-    if (!areLike)
-        forceNorms.assign(terms.size(), 0.0);
+    bounds = newBounds;
+    forceNorms.assign(terms.size(), 0.0);
+    forgetForces();
+}
+
+vector<double> StepMonitor::getReferences() const {
+    vector<double> references;
+    for (const Term& term : terms)
+        references.push_back(term.reference);
+    return references;
+}
+
+void StepMonitor::setReferences(const vector<double>& references) {
+    for (size_t k = 0; k < references.size(); k++)
+        setReference((int) k, references[k]);
 }
 
 bool StepMonitor::needConstraints(const vector<Term>& terms) {
@@ -107,17 +107,18 @@ void StepMonitor::sumForces(const vector<Vec3>& newForces, int block) {
         blockAppliedSums[block] = sumOf(end - first, [&](int i) { return square(i) * inverseMasses[i]; });
 }
 
-void StepMonitor::setForces(const vector<Vec3>& newForces, double energy, bool areSummed) {
+void StepMonitor::takeForces(const StepState& state, bool areSummed) {
+    const vector<Vec3>& newForces = state.force;
     for (size_t block = 0; block < blockSums.size() && !areSummed; block++)
         sumForces(newForces, (int) block);
     forces = &newForces;
-    groupEnergy = energy;
+    groupEnergy = state.groupEnergy;
     forceSquared = total(blockSums);
     appliedForceSquared = total(blockAppliedSums);
     const int numParticles = system.getNumParticles();
     auto square = [&](int i) { return squareOf(newForces[i], i); };
     for (size_t k = 0; k < terms.size(); k++) {
-        const Parts parts = partsOf(terms[k].kind);
+        const Parts parts = PARTS[terms[k].kind];
         if (parts.norm == Power && parts.force == One)
             forceNorms[k] = pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(square(i)); });
         else if (parts.norm == Largest && parts.velocity == No)
@@ -133,46 +134,97 @@ template <class Size> double StepMonitor::pNorm(int count, double order, const S
     return largest * std::pow(solver.sum(count, [&](int i) { return std::pow(size(i) / largest, order); }), 1 / order);
 }
 
-StepMonitor::Sums StepMonitor::makeSums() const {
-    const vector<double> zeros(solver.getNumRanges(), 0.0);
-    return {zeros, zeros};
-}
-
 void StepMonitor::sumRange(const vector<double>& multipliers, const vector<double>& rightSide, int range, int first,
-                           int end, Sums& sums) const {
+                           int end, Sums& to) const {
     const double *lambda = multipliers.data() + first, *right = rightSide.data() + first;
-    sums.forces[range] = sumOf(end - first, [&](int k) { return lambda[k] * right[k]; });
+    to.forces[range] = sumOf(end - first, [&](int k) { return lambda[k] * right[k]; });
     if (anyOf(terms, [](const Parts& parts) { return parts.multipliers && parts.norm == Square; }))
-        sums.multipliers[range] = sumOf(end - first, [&](int k) {
+        to.multipliers[range] = sumOf(end - first, [&](int k) {
             const double given = system.toGivenMultiplier(first + k) * lambda[k];
             return given * given;
         });
 }
 
-StepMonitor::Sums StepMonitor::sum(const vector<double>& multipliers, const vector<double>& rightSide) const {
-    Sums sums = makeSums();
+void StepMonitor::sum(const vector<double>& multipliers, const vector<double>& rightSide) {
     solver.forRanges([&](int range, int first, int end) { sumRange(multipliers, rightSide, range, first, end, sums); });
-    return sums;
+}
+
+void StepMonitor::see(const vector<double>& multipliers, const vector<double>& rightSide) {
+    seenForces = nullptr;
+    seenMultipliers = &multipliers;
+    seenRightSide = &rightSide;
+    seenHalf = nullptr;
+}
+
+ConstraintSolver::Coupled StepMonitor::observeTrial(const ExpressionParameters& theta) {
+    see(trial.multipliers, trial.rightSide);
+    return {theta, trial.multipliers, trial.rightSide};
+}
+
+void StepMonitor::observe(const ConstraintSolver::OnStep& end) {
+    see(end.multipliers, end.rightSide);
+    forces = nullptr;
+    seenForces = &end.forces;
+    seenHalf = end.atHalfStep;
+}
+
+void StepMonitor::seeParticles(int block) {
+    if (seenForces != nullptr)
+        sumForces(*seenForces, block);
+}
+
+void StepMonitor::seeConstraints(int range, int first, int end) {
+    sumRange(*seenMultipliers, *seenRightSide, range, first, end, sums);
+    if (seenHalf != nullptr)
+        sumRange(seenHalf->multipliers, seenHalf->rightSide, range, first, end, halfSums);
 }
 
 // ---------------------------------------------------------------------------------------------------------- the values
 
 double StepMonitor::sumOfForces(Kind kind) const {
-    const Weight weight = partsOf(kind).force;
+    const Weight weight = PARTS[kind].force;
     return weight == One ? forceSquared : weight == OverMass ? appliedForceSquared : 0.0;
 }
 
-void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const Sums& sums,
+void StepMonitor::evaluate(const StepState& state, vector<double>& values) {
+    const bool isSeen = seenForces == &state.force;
+    if (!isSeen)
+        sum(state.lambda, state.rightSide);
+    if (forces != &state.force)
+        takeForces(state, isSeen);
+    seenForces = nullptr;
+    evaluate(state.v, state.lambda, sums, values);
+}
+
+void StepMonitor::evaluateHalfStep(const StepState& state, const ConstraintSolver::HalfStep& half,
+                                   vector<double>& values) {
+    evaluate(state.w, half.multipliers, halfSums, values);
+}
+
+void StepMonitor::evaluateTrial(const StepState& state, const vector<Vec3>& v, vector<double>& values) {
+    if (forces != &state.force)
+        takeForces(state, false);
+    evaluate(v, trial.multipliers, sums, values);
+}
+
+void StepMonitor::evaluateAt(const StepState& state, const vector<Vec3>& v, const ExpressionParameters& theta,
+                             vector<double>& values) {
+    solver.findMultipliers(v, theta, trial.multipliers, trial.rightSide); // (4.3)
+    sum(trial.multipliers, trial.rightSide);
+    evaluateTrial(state, v, values);
+}
+
+void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipliers, const Sums& from,
                            vector<double>& values) {
     // Lambda^T K Lambda; rounding could make it negative where it vanishes.
-    const double sum = total(sums.forces);
-    constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
-    multipliersSquared = total(sums.multipliers);
+    const double sum = total(from.forces);
+    const double constraintForceSquared = std::isnan(sum) ? sum : std::max(sum, 0.0);
+    const double multipliersSquared = total(from.multipliers);
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     const vector<double>& masses = system.getMasses();
     values.resize(terms.size());
     for (size_t k = 0; k < terms.size(); k++) {
-        const Parts parts = partsOf(terms[k].kind);
+        const Parts parts = PARTS[terms[k].kind];
         auto square = [&](int i) {
             return masses[i] > 0 ? (parts.velocity == Mass ? masses[i] : 1.0) * v[i].dot(v[i]) : 0.0;
         };
@@ -192,6 +244,8 @@ void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipli
 }
 
 void StepMonitor::requireValid(const vector<double>& values) const {
+    if (!std::isfinite(forceSquared))
+        throw StepFailure("the force on a particle is infinite or not a number");
     for (size_t k = 0; k < terms.size(); k++)
         if (!(values[k] >= 0) || !std::isfinite(values[k]))
             throw StepFailure("monitor " + std::to_string(k) + " became " + std::to_string(values[k]) +
@@ -200,24 +254,30 @@ void StepMonitor::requireValid(const vector<double>& values) const {
                                    : ", while a monitor must stay positive and finite"));
 }
 
-bool StepMonitor::isNegligible(int index, double value, const vector<Vec3>& v, double speed,
-                               double acceleration) const {
+bool StepMonitor::isNegligible(int index, double value, const StepState& state, double speed, double acceleration) {
     if (!(value > 0))
         return true;
-    const Parts parts = partsOf(terms[index].kind);
+    const vector<Vec3>& v = state.v;
+    const Parts parts = PARTS[terms[index].kind];
     if (parts.norm == Energy)
         return false;
+    if (forces != &state.force)
+        takeForces(state, false);
     if (parts.ofConstraints() && value * value - sumOfForces(terms[index].kind) >
                                      std::pow(solver.findMultiplierRounding(parts.constraintForce, v, acceleration), 2))
         return false;
     for (int i = 0; i < system.getNumParticles(); i++)
-        if ((parts.force != No && squareOf((*forces)[i], i) > std::pow(system.getMasses()[i] * acceleration, 2)) ||
+        if ((parts.force != No && squareOf(state.force[i], i) > std::pow(system.getMasses()[i] * acceleration, 2)) ||
             (parts.velocity != No && system.getMasses()[i] > 0 && !(v[i].dot(v[i]) <= speed * speed)))
             return false;
     return true;
 }
 
 double StepMonitor::combine(const vector<double>& values) const {
+    return bounds.limit(combineUnbounded(values));
+}
+
+double StepMonitor::combineUnbounded(const vector<double>& values) const {
     if (terms.empty())
         return 1;
     double sum = 0, sumOfWeights = 0;
@@ -246,17 +306,17 @@ double StepMonitor::derivativeOfU(size_t index, const vector<double>& values, do
 }
 
 void StepMonitor::evaluateGradient(const ExpressionParameters& theta, const vector<Vec3>& v,
-                                   const vector<double>& multipliers, const vector<double>& values,
-                                   vector<Vec3>& gradient) {
+                                   const vector<double>& values, vector<Vec3>& gradient) {
+    const vector<double>& multipliers = trial.multipliers;
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     std::fill(gradient.begin(), gradient.end(), Vec3());
     // du/dLambda is collected in two parts: y, which needs a product with K^-1, and x, which is K^-1 du/dLambda already.
     std::fill(toSolve.begin(), toSolve.end(), 0.0);
     std::fill(solved.begin(), solved.end(), 0.0);
-    const double u = combine(values);
+    const double u = combineUnbounded(values);
     for (size_t k = 0; k < terms.size(); k++) {
-        const Parts parts = partsOf(terms[k].kind);
+        const Parts parts = PARTS[terms[k].kind];
         const double value = values[k], factor = derivativeOfU(k, values, u);
         if (factor == 0)
             continue;
@@ -283,11 +343,14 @@ void StepMonitor::evaluateGradient(const ExpressionParameters& theta, const vect
             if (masses[i] > 0)
                 gradient[i] += v[i] * (factor / value * (parts.velocity == Mass ? masses[i] : 1.0));
     }
-    if (!anyOf(terms, [](const Parts& parts) { return parts.ofConstraints(); }))
-        return;
-    // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-    solver.solveMatrix(toSolve);
-    for (int j = 0; j < numConstraints; j++)
-        solved[j] = 2 * (solved[j] + toSolve[j]);
-    solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
+    if (anyOf(terms, [](const Parts& parts) { return parts.ofConstraints(); })) {
+        // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
+        solver.solveMatrix(toSolve);
+        for (int j = 0; j < numConstraints; j++)
+            solved[j] = 2 * (solved[j] + toSolve[j]);
+        solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
+    }
+    const double slope = bounds.limitDerivative(u);
+    for (Vec3& each : gradient)
+        each *= slope;
 }

@@ -6,7 +6,8 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
-#include <cmath>
+#include "step/StepDensity.h"
+#include "step/StepState.h"
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -14,12 +15,12 @@ namespace OpenMMVRattle {
 /**
  * The monitors U_k(q,p) of docs/method.md, section 4, their combination
  *
- *     u = sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2),
+ *     u = B(sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2)),
  *
  * and the derivative of u with respect to the velocities, at fixed positions. A monitor sees q only through the applied
  * force F, through the multipliers Lambda(q,p) and through the energy of a force group.
  */
-class StepMonitor {
+class StepMonitor : public ConstraintSolver::Observer {
 public:
     enum Kind {
         ConstraintMultipliers,
@@ -44,17 +45,15 @@ public:
             return kind == other.kind && weight == other.weight && power == other.power && order == other.order;
         }
     };
-    /** Sums over each range of constraints (ConstraintSolver::getNumRanges()) for one set of multipliers, added in that order. */
-    struct Sums {
-        std::vector<double> forces,
-            multipliers; // of Lambda_k (K Lambda)_k and (d_k Lambda_k)^2, d_k Lambda_k in users' units
-    };
 
     explicit StepMonitor(ConstraintSolver& solver);
-    void setTerms(const std::vector<Term>& newTerms);
+    /** @param bounds    B, through which u goes */
+    void setTerms(const std::vector<Term>& newTerms, const StepDensity& bounds);
     const std::vector<Term>& getTerms() const {
         return terms;
     }
+    std::vector<double> getReferences() const;
+    void setReferences(const std::vector<double>& references);
     void setReference(int index, double value) {
         terms[index].reference = value;
     }
@@ -64,37 +63,28 @@ public:
     bool dependsOnVelocities() const;
     bool usesVelocities() const;
 
-    /** The part of setForces() that concerns a block of particles (ConstraintSystem::getBlocks()); threads may share the blocks. */
-    void sumForces(const std::vector<OpenMM::Vec3>& forces, int block);
-    /**
-     * Take over the forces at new positions (kJ/mol/nm) and the energy of the monitor's force group there (kJ/mol), on which the
-     * following evaluations are based.
-     *
-     * @param areSummed    sumForces() has been called for all blocks already
-     */
-    void setForces(const std::vector<OpenMM::Vec3>& newForces, double energy, bool areSummed = false);
-    /** Whether these were all finite. */
-    bool hasFiniteForces() const {
-        return std::isfinite(forceSquared);
+    /** What the solver finds with this as its observer is to be seen: the multipliers of trial velocities, and these parameters; */
+    ConstraintSolver::Coupled observeTrial(const ExpressionParameters& theta);
+    /** or all that there is at the end of a step, with its forces. */
+    void observe(const ConstraintSolver::OnStep& end);
+    /** U_k at a state, whether it has just been observed or not. */
+    void evaluate(const StepState& state, std::vector<double>& values);
+    /** U_k at its half-step velocities, after that. */
+    void evaluateHalfStep(const StepState& state, const ConstraintSolver::HalfStep& half, std::vector<double>& values);
+    /** U_k at a state but for its velocities, which are those of the trial that has been observed. */
+    void evaluateTrial(const StepState& state, const std::vector<OpenMM::Vec3>& v, std::vector<double>& values);
+    /** The same at velocities that nobody has observed. */
+    void evaluateAt(const StepState& state, const std::vector<OpenMM::Vec3>& v, const ExpressionParameters& theta,
+                    std::vector<double>& values);
+    /** The state that was evaluated last has been moved to another place. */
+    void movedTo(const StepState& state) {
+        forces = &state.force;
     }
-    /** They now lie elsewhere. */
-    void forcesMoved(const std::vector<OpenMM::Vec3>& newForces) {
-        forces = &newForces;
+    /** Forces have changed in place. */
+    void forgetForces() {
+        forces = seenForces = nullptr;
     }
-    Sums makeSums() const;
-    /** Make the sums of one range; threads may share the ranges. */
-    void sumRange(const std::vector<double>& multipliers, const std::vector<double>& rightSide, int range, int first,
-                  int end, Sums& sums) const;
-    Sums sum(const std::vector<double>& multipliers, const std::vector<double>& rightSide) const;
-    /**
-     * U_k at velocities v, for every term.
-     *
-     * @param multipliers    Lambda(q,p) at these velocities
-     * @param sums           those of these multipliers
-     */
-    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers, const Sums& sums,
-                  std::vector<double>& values);
-    /** Throws a StepFailure if a value is not a finite number, or negative. */
+    /** Throws a StepFailure if a force or value of the last evaluation is not a finite number, or a value is negative. */
     void requireValid(const std::vector<double>& values) const;
     /**
      * Whether a value of evaluate() is zero but for rounding, as that of multipliers where nothing pulls, or of forces that cancel
@@ -103,32 +93,48 @@ public:
      * @param speed           one that changes no position by more than rounding in a step (nm/ps)
      * @param acceleration    the same of an acceleration (nm/ps^2)
      */
-    bool isNegligible(int index, double value, const std::vector<OpenMM::Vec3>& v, double speed,
-                      double acceleration) const;
-    /** u, the combination of the values; 1 if there is no term. A term without a reference counts as if it had its value there. */
+    bool isNegligible(int index, double value, const StepState& state, double speed, double acceleration);
+    /** u, the combination of the values. A term without a reference counts as if it had its value there. */
     double combine(const std::vector<double>& values) const;
-    /**
-     * du/dv at the state of the last evaluate(), at the positions of the solver, the chain rule through Lambda (Lemma 4.2) included.
-     *
-     * @param theta          the parameters of the expressions
-     * @param values         what evaluate() gave
-     */
+    /** du/dv where these values have been found last, with the chain rule through Lambda (Lemma 4.2). */
     void evaluateGradient(const ExpressionParameters& theta, const std::vector<OpenMM::Vec3>& v,
-                          const std::vector<double>& multipliers, const std::vector<double>& values,
-                          std::vector<OpenMM::Vec3>& gradient);
+                          const std::vector<double>& values, std::vector<OpenMM::Vec3>& gradient);
 
 private:
+    /** Over each range of constraints: of Lambda_k (K Lambda)_k, and of (d_k Lambda_k)^2 with d_k Lambda_k in users' units. */
+    struct Sums {
+        std::vector<double> forces, multipliers;
+    };
+    void seeParticles(int block) override;
+    void seeConstraints(int range, int first, int end) override;
+    void sumForces(const std::vector<OpenMM::Vec3>& newForces, int block);
+    void sumRange(const std::vector<double>& multipliers, const std::vector<double>& rightSide, int range, int first,
+                  int end, Sums& to) const;
+    void sum(const std::vector<double>& multipliers, const std::vector<double>& rightSide);
+    void see(const std::vector<double>& multipliers, const std::vector<double>& rightSide);
+    void takeForces(const StepState& state, bool areSummed);
+    void evaluate(const std::vector<OpenMM::Vec3>& v, const std::vector<double>& multipliers, const Sums& from,
+                  std::vector<double>& values);
     template <class Size> double pNorm(int count, double order, const Size& size) const;
+    double combineUnbounded(const std::vector<double>& values) const;
     double derivativeOfU(size_t index, const std::vector<double>& values, double u) const;
     double squareOf(const OpenMM::Vec3& force, int particle) const;
     double sumOfForces(Kind kind) const;
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     std::vector<Term> terms;
-    const std::vector<OpenMM::Vec3>* forces;
-    double groupEnergy, forceSquared, appliedForceSquared, constraintForceSquared, multipliersSquared;
+    StepDensity bounds;
+    // Of the state that was evaluated last.
+    const std::vector<OpenMM::Vec3>* forces; // or null
+    double groupEnergy, forceSquared, appliedForceSquared;
     std::vector<double> forceNorms; // of the terms that are a norm of the forces other than the square one
-    std::vector<double> blockSums, blockAppliedSums; // of |F|^2 and |F|^2/m over each block
+    // What is to be seen in a pass, and the sums of that; of |F|^2 and |F|^2/m over each block.
+    const std::vector<OpenMM::Vec3>* seenForces; // or null
+    const std::vector<double>*seenMultipliers, *seenRightSide;
+    const ConstraintSolver::HalfStep* seenHalf; // or null
+    ConstraintSolver::HalfStep trial;
+    std::vector<double> blockSums, blockAppliedSums;
+    Sums sums, halfSums;
     std::vector<double> toSolve, solved;
 };
 

@@ -33,16 +33,9 @@ double dot(const vector<double>& a, const vector<double>& b) {
 } // namespace
 
 StepSolver::StepSolver(ConstraintSolver& constraints, const StepState& now) :
-        constraints(constraints), now(now), h(0), tolerance(0), isMoving(false), isFromOnStep(false), lastDrift(0),
-        offsetObserver(*this), numNewtonIterations(0) {
-    const ConstraintSystem& system = constraints.getSystem();
-    for (vector<Vec3>* vectors : {&next.q, &next.w, &next.v, &gradient, &halfStepChange})
-        vectors->resize(system.getNumParticles());
-    for (vector<double>* numbers : {&multiplierOffset, &offsetNext, &next.lambda, &next.rightSide, &lambdaNext,
-                                    &multiplierTrial, &rightSideTrial, &correction, &coupling, &response})
-        numbers->resize(system.getNumConstraints());
-    next.theta = thetaHalf = system.getGivenParameters();
-    parameterChange.resize(next.theta.values.size());
+        motion(constraints.getSystem()), next(constraints.getSystem()), kind(First), size(0), constraints(constraints),
+        now(now), h(0), tolerance(0), isFromOnStep(false), lastDrift(0), correction(next.lambda), coupling(next.lambda),
+        response(next.lambda), gradient(next.q), halfStepChange(next.q), numNewtonIterations(0) {
 }
 
 void StepSolver::setSettings(double stepSize, double newTolerance) {
@@ -51,94 +44,56 @@ void StepSolver::setSettings(double stepSize, double newTolerance) {
     constraints.setTolerance(tolerance);
 }
 
-void StepSolver::prepare(const vector<double>& target) {
-    isMoving = target != now.theta.values;
-    next.theta.values = target;
-    thetaHalf.values = now.theta.values;
-    if (isMoving)
-        constraints.getSystem().findParameterChange(now.q, now.theta, target, parameterChange);
-    else
-        std::fill(parameterChange.begin(), parameterChange.end(), 0.0);
-}
-
-void StepSolver::setRates(ExpressionParameters& theta, double size) const {
-    theta.isMoving = isMoving;
-    for (size_t k = 0; k < parameterChange.size(); k++)
-        theta.rates[k] = parameterChange[k] / size;
-}
-
-const ExpressionParameters& StepSolver::parametersAtRateOf(double size) {
-    setRates(thetaHalf, size);
-    return thetaHalf;
+void StepSolver::prepare() {
+    motion.prepare(now.q, now.theta);
+    next.theta.values = motion.target;
 }
 
 ConstraintSolver::Trial StepSolver::trialTo(double kick, double drift, const vector<Vec3>& start) {
     lastDrift = drift;
     isFromOnStep = &start == &now.v;
-    return {start, kick, drift, next.theta, next.q, next.w, lambdaNext};
+    return {start, kick, drift, next.theta, next.q, next.w, next.offset.found};
 }
 
 // Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes that O(h^3).
 ConstraintSolver::Guess StepSolver::regularGuess() const {
-    return {now.lambda, &multiplierOffset, REGULAR_MARGIN};
+    return {now.lambda, &now.offset, REGULAR_MARGIN};
 }
 
 bool StepSolver::solve(double rho, double rhoNext) {
     return constraints.solvePositions(trialTo(0.5 * (h / rho + h / rhoNext), h / rhoNext, now.w), regularGuess());
 }
 
-bool StepSolver::solveFromOnStep(double size) {
-    return constraints.solvePositions(trialTo(0.5 * size, size, now.v), {now.lambda, nullptr, ON_STEP_MARGIN});
+bool StepSolver::solveFromOnStep(double stepSize) {
+    return constraints.solvePositions(trialTo(0.5 * stepSize, stepSize, now.v), {now.lambda, nullptr, ON_STEP_MARGIN});
 }
 
-bool StepSolver::solveBackwards(double size, StepState& back) {
-    back.theta = next.theta;
-    setRates(back.theta, size);
-    for (size_t k = 0; k < parameterChange.size(); k++)
-        back.theta.values[k] = now.theta.values[k] - parameterChange[k];
-    return constraints.solvePositions({now.v, -0.5 * size, -size, back.theta, back.q, back.w, lambdaNext},
-                                      {now.lambda, nullptr, ON_STEP_MARGIN});
+bool StepSolver::solveBackwards(double stepSize, StepState& back) {
+    motion.goBack(stepSize, back.theta);
+    return constraints.solvePositions(
+        {now.v, -0.5 * stepSize, -stepSize, back.theta, back.q, back.w, back.offset.found},
+        {now.lambda, nullptr, ON_STEP_MARGIN});
 }
 
 std::string StepSolver::explainFailure() {
     const vector<Vec3>& start = isFromOnStep ? now.v : now.w;
     std::string reason = constraints.explainFailure(trialTo(0.0, lastDrift, start));
-    if (isMoving)
+    if (motion.isMoving())
         reason += "; parameters of constraints have been changed for this step, so move them by less at a time";
     return reason;
 }
 
-void StepSolver::stay() {
-    next.q = now.q;
-    next.w = now.w;
-    next.theta = now.theta;
-    lambdaNext = now.lambda;
+// The state at its end takes the place of the one before.
+void StepSolver::accept(StepState& last) {
+    if (kind == Regular)
+        next.offset.expected.swap(last.lambda);
+    else
+        std::swap(next.offset, last.offset);
+    std::swap(next, last);
 }
 
-void StepSolver::keepOffset() {
-    for (size_t k = 0; k < lambdaNext.size(); k++)
-        multiplierOffset[k] = lambdaNext[k] - now.lambda[k];
-}
-
-ConstraintSolver::Observer* StepSolver::observeOffset(ConstraintSolver::Observer* observer) {
-    offsetObserver.other = observer;
-    return &offsetObserver;
-}
-
-void StepSolver::OffsetObserver::seeParticles(int block) {
-    other->seeParticles(block);
-}
-
-void StepSolver::OffsetObserver::seeConstraints(int range, int first, int end) {
-    const double *found = solver.lambdaNext.data(), *lambda = solver.now.lambda.data();
-    double* offset = solver.offsetNext.data();
-    for (int k = first; k < end; k++)
-        offset[k] = found[k] - lambda[k];
-    other->seeConstraints(range, first, end);
-}
-
-bool StepSolver::solve(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
-    return solveByChord(equation, given, rhoNext) || solveByNewton(equation, given, rhoNext);
+bool StepSolver::solve(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext) {
+    return solveByChord(monitor, equation, rhoNext) || solveByNewton(monitor, equation, rhoNext);
 }
 
 /*
@@ -146,9 +101,9 @@ bool StepSolver::solve(DensityEquation& equation, const DensityEquation::Given& 
  * derivative is 1 + (h/(2 rho+^2)) du/dp (F - G^T Lambda) along the constraints; what either update does to the other's equation is
  * of higher order in h and left to the next pass.
  */
-bool StepSolver::solveByChord(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
-    const double rho = given.rho;
-    rhoNext = given.explicitValue + given.offset;
+bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext) {
+    const double rho = equation.rho;
+    rhoNext = equation.explicitValue + equation.offset;
     if (!(rhoNext > 0))
         return false;
     double previous = std::numeric_limits<double>::infinity();
@@ -156,11 +111,11 @@ bool StepSolver::solveByChord(DensityEquation& equation, const DensityEquation::
     for (int pass = 0; pass <= MAX_COUPLED_PASSES; pass++) {
         const ConstraintSolver::Trial trial = trialTo(0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext, now.w);
         const ConstraintSolver::Guess start = regularGuess();
-        const double constraintError = constraints.coupledPass(
-            trial, {parametersAtRateOf(trial.drift), multiplierTrial, rightSideTrial}, pass == 0 ? &start : nullptr,
-            equation.observeTrial(multiplierTrial, rightSideTrial));
-        const double uPlus = equation.evaluate(next.w, multiplierTrial);
-        const double mismatch = rhoNext - uPlus + given.known;
+        const double constraintError = constraints.coupledPass(trial, monitor.observeTrial(motion.atStart(trial.drift)),
+                                                               pass == 0 ? &start : nullptr, &monitor);
+        monitor.evaluateTrial(now, next.w, values);
+        const double uPlus = monitor.combine(values);
+        const double mismatch = rhoNext - uPlus + equation.known;
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
         if (pass > 0 && error <= 1)
@@ -168,7 +123,7 @@ bool StepSolver::solveByChord(DensityEquation& equation, const DensityEquation::
         if (!std::isfinite(error) || error > SLOW_COUPLED_CONVERGENCE * previous)
             return false;
         previous = error;
-        rhoNext -= mismatch / (1 + 0.5 * h * given.rate / (rhoNext * rhoNext));
+        rhoNext -= mismatch / (1 + 0.5 * h * equation.rate / (rhoNext * rhoNext));
         if (!(rhoNext > 0))
             return false;
     }
@@ -176,9 +131,9 @@ bool StepSolver::solveByChord(DensityEquation& equation, const DensityEquation::
 }
 
 // Newton's iteration on (lambda, rho+) by the Schur complement (docs/method.md, section 8), for all constraints.
-bool StepSolver::solveByNewton(DensityEquation& equation, const DensityEquation::Given& given, double& rhoNext) {
-    const double rho = given.rho;
-    rhoNext = given.explicitValue > 0 ? given.explicitValue : given.fallBack;
+bool StepSolver::solveByNewton(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext) {
+    const double rho = equation.rho;
+    rhoNext = equation.explicitValue > 0 ? equation.explicitValue : equation.fallBack;
     int numCuts = 0;
     double previous = std::numeric_limits<double>::infinity();
     for (int iteration = 0; iteration < MAX_NEWTON_ITERATIONS; iteration++) {
@@ -187,12 +142,11 @@ bool StepSolver::solveByNewton(DensityEquation& equation, const DensityEquation:
         if (iteration == 0)
             constraints.guess(trial, regularGuess());
         const double constraintError = constraints.evaluate(trial);
-        constraints.findMultipliers(next.w, parametersAtRateOf(drift), multiplierTrial, rightSideTrial);
-        ConstraintSolver::Observer* observer = equation.observeTrial(multiplierTrial, rightSideTrial);
-        constraints.forRanges([&](int range, int first, int end) { observer->seeConstraints(range, first, end); });
-        const double uPlus = equation.evaluate(next.w, multiplierTrial);
+        const ExpressionParameters& theta = motion.atStart(drift);
+        monitor.evaluateAt(now, next.w, theta, values);
+        const double uPlus = monitor.combine(values);
         // F_rho of docs/method.md, section 8
-        const double mismatch = rhoNext - uPlus + given.known;
+        const double mismatch = rhoNext - uPlus + equation.known;
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       relativeMismatch / std::max(REGULAR_MARGIN * tolerance, DENSITY_ROUNDING));
@@ -206,7 +160,7 @@ bool StepSolver::solveByNewton(DensityEquation& equation, const DensityEquation:
         if (!constraints.linearize(trial))
             return false;
         // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-        equation.findGradient(next.w, thetaHalf, multiplierTrial, gradient);
+        monitor.evaluateGradient(theta, next.w, values, gradient);
         constraints.multiplyOverMass(gradient, coupling);
         for (double& a : coupling)
             a *= kick;
@@ -229,8 +183,8 @@ bool StepSolver::solveByNewton(DensityEquation& equation, const DensityEquation:
             change = change > 0 ? 3 * rhoNext : -0.75 * rhoNext;
         }
         rhoNext += change;
-        for (size_t k = 0; k < lambdaNext.size(); k++)
-            lambdaNext[k] += correction[k] - response[k] * change;
+        for (size_t k = 0; k < correction.size(); k++)
+            trial.multipliers[k] += correction[k] - response[k] * change;
         numNewtonIterations++;
     }
     return false;

@@ -183,10 +183,11 @@ void testAtPositions(Pair& p) {
 void testSolvePositions(Pair& p) {
     const int m = p.system.getNumConstraints();
     Vectors q = p.q, w = p.e.velocities;
-    vector<double> lambda(m), guess(m, 0.0), offset(m, 1e-3);
+    vector<double> lambda(m), guess(m, 0.0);
+    const ConstraintSolver::Offset offset = {vector<double>(m, 3e-3), vector<double>(m, 2e-3)};
     const double kick = 0.7e-3, drift = 1.3e-3;
     const ConstraintSolver::Trial trial = {p.e.velocities, kick, drift, p.theta, q, w, lambda};
-    for (const vector<double>* extra : {(const vector<double>*) nullptr, (const vector<double>*) &offset}) {
+    for (const ConstraintSolver::Offset* extra : {(const ConstraintSolver::Offset*) nullptr, &offset}) {
         ASSERT(p.solver.solvePositions(trial, {guess, extra, 0.1}));
         ASSERT(p.largestError(q) <= TOLERANCE);
         const Vector expected = p.moving(p.e.velocities) +

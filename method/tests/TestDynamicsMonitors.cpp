@@ -35,41 +35,41 @@ struct Example {
     vector<Vec3> positions, velocities, forces;
 };
 
-// u(q,v) as a function of the velocities alone, from the pieces that the dynamics uses.
+// u(q,v) as a function of the velocities alone, as the dynamics evaluates it.
 class Evaluation {
 public:
-    Evaluation(const Example& e, vector<StepMonitor::Term> terms, double order) :
-            e(e), solver(e.masses, e.constraints, e.expressions), theta(solver.getSystem().getGivenParameters()),
-            monitor(solver), multipliers(solver.getSystem().getNumConstraints()), rightSide(multipliers) {
-        solver.moveTo(e.positions, theta, e.forces);
+    Evaluation(const Example& e, vector<StepMonitor::Term> terms, double order, const StepDensity& bounds = {}) :
+            solver(e.masses, e.constraints, e.expressions), state(solver.getSystem()), monitor(solver) {
+        state.q = e.positions;
+        state.v = e.velocities;
+        state.force = e.forces;
+        state.groupEnergy = 4.2;
+        solver.moveTo(state.q, state.theta, state.force);
         for (StepMonitor::Term& term : terms)
             term.order = order;
-        monitor.setTerms(terms);
-        monitor.setForces(e.forces, 4.2);
+        monitor.setTerms(terms, bounds);
     }
     double u(const vector<Vec3>& v) {
-        solver.findMultipliers(v, theta, multipliers, rightSide);
-        monitor.evaluate(v, multipliers, monitor.sum(multipliers, rightSide), values);
+        monitor.evaluateAt(state, v, state.theta, values);
         return monitor.combine(values);
     }
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
         vector<Vec3> result(v.size());
-        monitor.evaluateGradient(theta, v, multipliers, values, result);
+        monitor.evaluateGradient(state.theta, v, values, result);
         return result;
     }
-    const Example& e;
     ConstraintSolver solver;
-    ExpressionParameters theta;
+    StepState state;
     StepMonitor monitor;
-    vector<double> multipliers, rightSide, values;
+    vector<double> values;
 };
 
 static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
-                          const vector<ExpressionConstraint>& expressions = {}) {
+                          const vector<ExpressionConstraint>& expressions = {}, const StepDensity& bounds = {}) {
     Example e;
     e.expressions = expressions;
-    Evaluation evaluation(e, terms, order);
+    Evaluation evaluation(e, terms, order, bounds);
     vector<Vec3> gradient = evaluation.gradient(e.velocities);
     double largest = 0;
     for (const Vec3& g : gradient)
@@ -106,7 +106,7 @@ void testCombinationGradient() {
                    {StepMonitor::ConstraintForce, 2.0, 0.5, 800.0},
                    {StepMonitor::ForcePNorm, 0.3, 1.0, 200.0},
                    {StepMonitor::VectorField, 0.7, 2.0, 900.0}},
-                  8);
+                  8, {}, StepDensity(StepDensity::SemiExplicit, 1.0, 0.05, 3.0));
 }
 
 void testCombination() {
@@ -122,7 +122,7 @@ void testCombination() {
     ASSERT_EQUAL_TOL(1.0, evaluation.monitor.combine(values), 1e-14);
     double expected = std::sqrt((9 * 4.0 + 0.25 * 3.0) / 9.25); // U1 doubled; U2 trebled, to the power 1/2
     ASSERT_EQUAL_TOL(expected, evaluation.monitor.combine({2 * values[0], 3 * values[1]}), 1e-14);
-    evaluation.monitor.setTerms({});
+    evaluation.monitor.setTerms({}, {});
     ASSERT_EQUAL(1.0, evaluation.monitor.combine({}));
 }
 
@@ -135,13 +135,13 @@ void testNegligibleMultipliers() {
     }
     Evaluation evaluation(
         e, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 1.0}, {StepMonitor::ConstraintForce, 1.0, 1.0, 1.0}}, 8);
-    evaluation.u(e.velocities);
-    ASSERT(evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, 0.0, 0.0));
-    ASSERT(evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, 0.0, 0.0));
-    e.velocities[0] = Vec3(0.3, 0.4001, 0);
-    evaluation.u(e.velocities);
-    ASSERT(!evaluation.monitor.isNegligible(0, evaluation.values[0], e.velocities, 0.0, 0.0));
-    ASSERT(!evaluation.monitor.isNegligible(1, evaluation.values[1], e.velocities, 0.0, 0.0));
+    for (bool isFalling : {true, false}) {
+        evaluation.u(evaluation.state.v);
+        for (int k = 0; k < 2; k++)
+            ASSERT_EQUAL(isFalling,
+                         evaluation.monitor.isNegligible(k, evaluation.values[k], evaluation.state, 0.0, 0.0));
+        evaluation.state.v[0] = Vec3(0.3, 0.4001, 0);
+    }
 }
 
 void testBounds() {

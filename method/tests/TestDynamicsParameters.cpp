@@ -5,7 +5,7 @@
 // step with all derivatives taken by differences.
 
 #include "TestSupport.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <Eigen/Dense>
 #include <cmath>
 #include <random>
@@ -34,15 +34,15 @@ Vectors noForce(const Vectors& q) {
     return Vectors(q.size());
 }
 
-VRattleDynamics::Settings fixedSteps(double size) {
+StepSettings fixedSteps(double size) {
     return {size, 0, 0, 1e-12, StepDensity::SemiExplicit, {}, false};
 }
 
-VRattleDynamics::Settings variableSteps(double size, StepDensity::Update update, StepMonitor::Kind kind) {
+StepSettings variableSteps(double size, StepDensity::Update update, StepMonitor::Kind kind) {
     return {size, 0, update == StepDensity::Bounded ? 2 * size : 0.0, 1e-12, update, {{kind, 1.0, 1.0, 0.0}}, false};
 }
 
-double takeStep(VRattleDynamics& dynamics, const ForceField& field, double maxStep = INFINITY) {
+double takeStep(VRattleRun& dynamics, const ForceField& field, double maxStep = INFINITY) {
     while (true) {
         const double size = dynamics.step(maxStep);
         Vectors forces = field(dynamics.getNextPositions());
@@ -51,7 +51,7 @@ double takeStep(VRattleDynamics& dynamics, const ForceField& field, double maxSt
     }
 }
 
-double kineticEnergy(const VRattleDynamics& dynamics) {
+double kineticEnergy(const VRattleRun& dynamics) {
     double sum = 0;
     const vector<double>& masses = dynamics.getConstraintSystem().getMasses();
     for (size_t i = 0; i < masses.size(); i++)
@@ -84,7 +84,7 @@ void assertNear(double expected, double found, double tolerance, const string& w
 // A bead at rest on a plane that is lifted has the plane's velocity in the first step, and none in the first in which it stands.
 void testPlane() {
     const double mass = 12, dt = 0.002, weight = 3;
-    VRattleDynamics dynamics({mass}, {}, {{"z1-height", {0}, {{"height", 0}}}});
+    VRattleRun dynamics({mass}, {}, {{"z1-height", {0}, {{"height", 0}}}});
     dynamics.setSettings(fixedSteps(dt));
     const ForceField field = [&](const Vectors&) { return Vectors{Vec3(0, 0, -weight)}; };
     dynamics.begin({Vec3()}, {Vec3(0.3, 0, 0)}, field({}), 0);
@@ -115,23 +115,23 @@ struct Dumbbell {
     ExpressionConstraint constraint(bool isSquared) const {
         return {isSquared ? "(x1-x2)^2+(y1-y2)^2+(z1-z2)^2-d^2" : DISTANCE, {0, 1}, {{"d", length}}};
     }
-    void begin(VRattleDynamics& dynamics, const VRattleDynamics::Settings& settings) const {
+    void begin(VRattleRun& dynamics, const StepSettings& settings) const {
         dynamics.setSettings(settings);
         const double total = mass1 + mass2;
         dynamics.begin({Vec3(length * mass2 / total, 0, 0), Vec3(-length * mass1 / total, 0, 0)},
                        {Vec3(0, spin * length * mass2 / total, 0), Vec3(0, -spin * length * mass1 / total, 0)},
                        Vectors(2), 0);
     }
-    double angularMomentum(const VRattleDynamics& dynamics) const {
+    double angularMomentum(const VRattleRun& dynamics) const {
         const Vectors &q = dynamics.getPositions(), &v = dynamics.getVelocities();
         return mass1 * q[0].cross(v[0])[2] + mass2 * q[1].cross(v[1])[2];
     }
 };
 
-void testDumbbell(const VRattleDynamics::Settings& settings) {
+void testDumbbell(const StepSettings& settings) {
     const Dumbbell dumbbell;
     for (bool isSquared : {false, true}) {
-        VRattleDynamics dynamics({dumbbell.mass1, dumbbell.mass2}, {}, {dumbbell.constraint(isSquared)});
+        VRattleRun dynamics({dumbbell.mass1, dumbbell.mass2}, {}, {dumbbell.constraint(isSquared)});
         dumbbell.begin(dynamics, settings);
         const double momentum = dumbbell.angularMomentum(dynamics);
         double length = dumbbell.length, work = 0, startEnergy = 0;
@@ -174,7 +174,7 @@ void testOrder() {
     for (int level = 0; level < 3; level++) {
         const int steps = 100 << level;
         const double dt = total / steps;
-        VRattleDynamics dynamics({mass}, {}, {{SPHERE, {0}, {{"px", 0}, {"py", 0}, {"pz", 0}, {"r", 1}}}});
+        VRattleRun dynamics({mass}, {}, {{SPHERE, {0}, {{"px", 0}, {"py", 0}, {"pz", 0}, {"r", 1}}}});
         dynamics.setSettings(fixedSteps(dt));
         dynamics.begin({Vec3(1, 0, 0)}, {Vec3(0, 0.2, -1)}, field({}), 0);
         auto energy = [&] { return kineticEnergy(dynamics) + mass * gravity * dynamics.getPositions()[0][2]; };
@@ -199,7 +199,7 @@ void testOrder() {
 void testFullTurn() {
     double ends[2];
     for (int wrapped = 0; wrapped < 2; wrapped++) {
-        VRattleDynamics dynamics({2.0}, {}, {{TURN, {0}, {{"angle", 3.1}}}});
+        VRattleRun dynamics({2.0}, {}, {{TURN, {0}, {{"angle", 3.1}}}});
         dynamics.setSettings(variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce));
         const double start = 3.1;
         const ForceField field = [](const Vectors&) { return Vectors{Vec3(0, 0.5, 0)}; };
@@ -269,7 +269,7 @@ struct Example {
             parameter.second += 0.005 * std::sin(0.01 * (1 + (e + 2 * k++) % 7) * step);
         return result;
     }
-    void setParameters(VRattleDynamics& dynamics, int step) const {
+    void setParameters(VRattleRun& dynamics, int step) const {
         for (size_t e = 0; e < expressions.size(); e++)
             dynamics.setParameters((int) e, parametersAt((int) e, step));
     }
@@ -363,7 +363,7 @@ struct Statement {
 
 void testEquations(StepDensity::Update update) {
     const Example e = makeSmall();
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     const ConstraintSystem& system = dynamics.getConstraintSystem();
     const Statement statement(e, system);
     ASSERT(system.getFirstGeneral() == 3); // the water is in a batch
@@ -426,7 +426,7 @@ void testManyThreads() {
     for (StepDensity::Update update : {StepDensity::SemiExplicit, StepDensity::Bounded}) {
         Vectors alone;
         for (int threads : {1, 3}) {
-            VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+            VRattleRun dynamics(e.masses, e.distances, e.expressions);
             int calls = 0;
             if (threads > 1)
                 dynamics.setParallel(runInReverse(threads, calls), threads);
@@ -457,7 +457,7 @@ void testManyThreads() {
 // Forward and back, with parameters that go back the way they came, or that stand after they have moved.
 void testReverse(bool isMoving) {
     const Example e = makeSmall();
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     dynamics.setSettings(variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce));
     dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
     takeStep(dynamics, springs);
@@ -486,21 +486,21 @@ void testReverse(bool isMoving) {
 void testResume() {
     const Example e = makeSmall();
     for (bool isAutomatic : {false, true}) {
-        VRattleDynamics::Settings settings =
-            variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce);
+        StepSettings settings = variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce);
         if (isAutomatic)
             settings = {0.002, 0, 0, 1e-12, StepDensity::SemiExplicit, {}, false, true, {30, 20}, 0};
-        VRattleDynamics dynamics(e.masses, e.distances, e.expressions), other(e.masses, e.distances, e.expressions);
-        for (VRattleDynamics* each : {&dynamics, &other})
+        VRattleRun dynamics(e.masses, e.distances, e.expressions), other(e.masses, e.distances, e.expressions);
+        for (VRattleRun* each : {&dynamics, &other})
             each->setSettings(settings);
         dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
         for (int step = 0; step < 10; step++) {
             e.setParameters(dynamics, step);
             takeStep(dynamics, springs);
         }
-        other.resume(dynamics.getPositions(), dynamics.getVelocities(), dynamics.getForces(), 0, dynamics.getMemory());
+        const VRattleRun::Kept kept = dynamics.keep();
+        other.resume(kept.state, kept.memory);
         for (int step = 10; step < 20; step++)
-            for (VRattleDynamics* each : {&dynamics, &other}) {
+            for (VRattleRun* each : {&dynamics, &other}) {
                 e.setParameters(*each, step);
                 takeStep(*each, springs);
             }
@@ -515,7 +515,7 @@ void testTooLargeJump() {
     const Example e = makeSmall();
     Vectors ends[2];
     for (int tries = 0; tries < 2; tries++) {
-        VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+        VRattleRun dynamics(e.masses, e.distances, e.expressions);
         dynamics.setSettings(variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce));
         dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
         for (int step = 0; step < 20; step++) {
@@ -537,7 +537,7 @@ void testTooLargeJump() {
 // A step that ends at a given time.
 void testShortenedStep() {
     const Dumbbell dumbbell;
-    VRattleDynamics dynamics({dumbbell.mass1, dumbbell.mass2}, {}, {dumbbell.constraint(false)});
+    VRattleRun dynamics({dumbbell.mass1, dumbbell.mass2}, {}, {dumbbell.constraint(false)});
     dumbbell.begin(dynamics, variableSteps(0.002, StepDensity::SemiExplicit, StepMonitor::ConstraintForce));
     const double momentum = dumbbell.angularMomentum(dynamics);
     double time = 0;
@@ -559,9 +559,9 @@ void testShortenedStep() {
 }
 
 // The start of a motion, and its end, leave no oscillation of the density behind.
-void testDensityAtStartOfMotion(const VRattleDynamics::Settings& settings) {
+void testDensityAtStartOfMotion(const StepSettings& settings) {
     // A bead runs around a ring, whose plane then moves along: |v| and with it the force change at once.
-    VRattleDynamics dynamics({2.0}, {}, {{"x1^2+y1^2-1", {0}, {}}, {"z1-tilt*x1", {0}, {{"tilt", 0.3}}}});
+    VRattleRun dynamics({2.0}, {}, {{"x1^2+y1^2-1", {0}, {}}, {"z1-tilt*x1", {0}, {{"tilt", 0.3}}}});
     dynamics.setSettings(settings);
     dynamics.begin({Vec3(1, 0, 0.3)}, {Vec3(0, 2, 0)}, Vectors(1), 0);
     if (settings.isAutomatic) { // without a force its two monitors are the same
@@ -583,14 +583,14 @@ void testDensityAtStartOfMotion(const VRattleDynamics::Settings& settings) {
 }
 
 // Forces whose parameter changes: the energy balance of a spring that is wound up, step by step, and no density lost.
-void testChangedForces(const VRattleDynamics::Settings& settings) {
+void testChangedForces(const StepSettings& settings) {
     double errors[2];
     for (int level = 0; level < 2; level++) {
-        VRattleDynamics::Settings finer = settings;
+        StepSettings finer = settings;
         finer.stepSize /= 1 << level;
         finer.maximumStep /= 1 << level;
         const Example e = makeSmall();
-        VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+        VRattleRun dynamics(e.masses, e.distances, e.expressions);
         dynamics.setSettings(finer);
         double scale = 1;
         auto potential = [&] {
@@ -629,7 +629,7 @@ void testChangedForces(const VRattleDynamics::Settings& settings) {
     const Example e = makeSmall();
     Vectors ends[2];
     for (int tries = 0; tries < 2; tries++) {
-        VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+        VRattleRun dynamics(e.masses, e.distances, e.expressions);
         dynamics.setSettings(settings);
         dynamics.begin(e.positions, e.velocities, springs(e.positions), 0);
         for (int step = 0; step < 5; step++) {
@@ -647,8 +647,8 @@ void testChangedForces(const VRattleDynamics::Settings& settings) {
 } // namespace
 
 int main() {
-    VRattleDynamics::Settings automatic = {0.002, 0, 0, 1e-12, StepDensity::SemiExplicit, {}, false, true, {30, 20}, 0};
-    VRattleDynamics::Settings automaticRing = automatic;
+    StepSettings automatic = {0.002, 0, 0, 1e-12, StepDensity::SemiExplicit, {}, false, true, {30, 20}, 0};
+    StepSettings automaticRing = automatic;
     automaticRing.automaticReferences[0] = automaticRing.automaticReferences[1] = 1;
     TestList tests = {{"plane", testPlane}, {"order", testOrder}, {"full turn", testFullTurn}};
     tests.emplace_back("dumbbell, fixed", [] { testDumbbell(fixedSteps(0.001)); });
@@ -656,8 +656,7 @@ int main() {
                                                               {"Explicit", StepDensity::Explicit},
                                                               {"Bounded", StepDensity::Bounded}};
     for (const auto& update : updates) {
-        const VRattleDynamics::Settings settings =
-            variableSteps(0.001, update.second, StepMonitor::ConstraintMultipliers);
+        const StepSettings settings = variableSteps(0.001, update.second, StepMonitor::ConstraintMultipliers);
         tests.emplace_back("dumbbell, " + update.first, [=] { testDumbbell(settings); });
         tests.emplace_back("equations, " + update.first, [=] { testEquations(update.second); });
         tests.emplace_back("start of motion, " + update.first, [=] {

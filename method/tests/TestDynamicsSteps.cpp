@@ -6,6 +6,7 @@
 
 #include "Examples.h"
 #include "TestSupport.h"
+#include "run/VRattleRun.h"
 #include <Eigen/Dense>
 #include <cmath>
 
@@ -37,18 +38,18 @@ static vector<Vec3> springsAt(const vector<Vec3>& positions) {
     return forces;
 }
 
-static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
+static StepSettings makeSettings(StepDensity::Update update) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0}}, false};
 }
 
 // Both halves of a step; returns whether it is complete.
-static bool takeStep(VRattleDynamics& dynamics) {
+static bool takeStep(VRattleRun& dynamics) {
     dynamics.step(INFINITY);
     vector<Vec3> forces = springsAt(dynamics.getNextPositions());
     return dynamics.finish(forces, 0);
 }
 
-static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
+static void run(VRattleRun& dynamics, const Example& e, int steps) {
     vector<Vec3> positions = e.positions;
     dynamics.begin(positions, e.velocities, springsAt(positions), 0);
     for (int i = 0; i < steps; i++)
@@ -57,7 +58,7 @@ static void run(VRattleDynamics& dynamics, const Example& e, int steps) {
 }
 
 // Lambda = K^-1 (g''(v,v) + G M^-1 F) for g = |r|^2 - d^2, in the order of the constraints.
-static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleDynamics& dynamics) {
+static Eigen::VectorXd denseMultipliers(const Example& e, const VRattleRun& dynamics) {
     const int m = (int) e.distances.size(), n = 3 * (int) e.masses.size();
     Eigen::MatrixXd g = Eigen::MatrixXd::Zero(m, n);
     Eigen::VectorXd curvature(m), force(n), inverseMass(n);
@@ -85,7 +86,7 @@ void testShapes(StepDensity::Update update) {
     for (int copies : {1, 2, 3}) {
         Example e;
         makeExample(e, copies);
-        VRattleDynamics dynamics(e.masses, e.distances);
+        VRattleRun dynamics(e.masses, e.distances);
         ASSERT(dynamics.getConstraintSystem().getBatches().size() == 5);
         ASSERT_EQUAL((int) e.distances.size() - 5, dynamics.getConstraintSystem().getFirstGeneral());
         dynamics.setSettings(makeSettings(update));
@@ -114,7 +115,7 @@ void testChangedFrame() {
     Example e;
     makeExample(e, 2);
     const vector<Vec3> noForces(e.masses.size());
-    auto takeFreeSteps = [&](VRattleDynamics& dynamics, int steps) {
+    auto takeFreeSteps = [&](VRattleRun& dynamics, int steps) {
         double time = 0;
         for (int i = 0; i < steps;) {
             const double size = dynamics.step(INFINITY);
@@ -128,9 +129,9 @@ void testChangedFrame() {
     };
     const Vec3 shift(0.3, -2, 0.7);
     for (auto kind : {StepMonitor::ConstraintMultipliers, StepMonitor::VectorField}) {
-        VRattleDynamics resting(e.masses, e.distances), moving(e.masses, e.distances);
-        for (VRattleDynamics* dynamics : {&resting, &moving}) {
-            VRattleDynamics::Settings settings = makeSettings(StepDensity::SemiExplicit);
+        VRattleRun resting(e.masses, e.distances), moving(e.masses, e.distances);
+        for (VRattleRun* dynamics : {&resting, &moving}) {
+            StepSettings settings = makeSettings(StepDensity::SemiExplicit);
             settings.terms[0].kind = kind;
             settings.tolerance = 1e-12;
             dynamics->setSettings(settings);
@@ -173,9 +174,9 @@ void testFailedSteps() {
                                      {Vec3(), Vec3(0.08, 0.06, 0), Vec3(-0.08, 0.06, 0)});
                     if (isGeneral)
                         makeExample(e, 1);
-                    VRattleDynamics tried(e.masses, e.distances), untried(e.masses, e.distances);
-                    for (VRattleDynamics* dynamics : {&tried, &untried}) {
-                        VRattleDynamics::Settings settings = makeSettings(update);
+                    VRattleRun tried(e.masses, e.distances), untried(e.masses, e.distances);
+                    for (VRattleRun* dynamics : {&tried, &untried}) {
+                        StepSettings settings = makeSettings(update);
                         settings.terms[0].kind = kind;
                         dynamics->setSettings(settings);
                         run(*dynamics, e, 5);

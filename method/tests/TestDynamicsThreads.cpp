@@ -7,7 +7,7 @@
 #include "Examples.h"
 #include "TestSupport.h"
 #include "constraints/SharedWork.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <atomic>
 #include <new>
 #include <thread>
@@ -53,7 +53,7 @@ Example makeTethered() {
     return e;
 }
 
-VRattleDynamics::Settings makeSettings(StepDensity::Update update, StepMonitor::Kind kind) {
+StepSettings makeSettings(StepDensity::Update update, StepMonitor::Kind kind) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{kind, 1.0, 1.0, 0.0}}, false};
 }
 
@@ -68,9 +68,9 @@ struct Outcome {
 };
 
 // All that a run does: a projection, a start, steps (so many first), time turned around, and changed velocities.
-Outcome run(const Example& e, const VRattleDynamics::Settings& settings, int steps,
-            const VRattleDynamics::Parallel& parallel, int numThreads) {
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+Outcome run(const Example& e, const StepSettings& settings, int steps, const VRattleRun::Parallel& parallel,
+            int numThreads) {
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     dynamics.setParallel(parallel, numThreads);
     dynamics.setSettings(settings);
     vector<Vec3> positions = e.positions;
@@ -93,9 +93,9 @@ Outcome run(const Example& e, const VRattleDynamics::Settings& settings, int ste
 }
 
 // Whatever the number of threads and whichever is first.
-void testSameBits(const Example& e, const vector<VRattleDynamics::Settings>& all, int steps, bool isCut) {
+void testSameBits(const Example& e, const vector<StepSettings>& all, int steps, bool isCut) {
     ASSERT_EQUAL(isCut, !ConstraintSystem(e.masses, e.distances, e.expressions).getPieces().empty());
-    for (const VRattleDynamics::Settings& settings : all) {
+    for (const StepSettings& settings : all) {
         const Outcome expected = run(e, settings, steps, {}, 1);
         ASSERT(run(e, settings, steps, runAtOnce(3), 3) == expected);
         int calls = 0;
@@ -147,13 +147,12 @@ void testExceptions() {
 } // namespace
 
 int main() {
-    const vector<VRattleDynamics::Settings>
-        some = {makeSettings(StepDensity::SemiExplicit, StepMonitor::ConstraintForce),
-                makeSettings(StepDensity::Explicit, StepMonitor::ConstraintMultipliers)},
-        all = {some[0],
-               some[1],
-               makeSettings(StepDensity::Bounded, StepMonitor::ConstraintAndAppliedForce),
-               {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, false, true, {1, 1}, 0}};
+    const vector<StepSettings> some = {makeSettings(StepDensity::SemiExplicit, StepMonitor::ConstraintForce),
+                                       makeSettings(StepDensity::Explicit, StepMonitor::ConstraintMultipliers)},
+                               all = {some[0],
+                                      some[1],
+                                      makeSettings(StepDensity::Bounded, StepMonitor::ConstraintAndAppliedForce),
+                                      {0.002, 0, 0, 1e-10, StepDensity::SemiExplicit, {}, false, true, {1, 1}, 0}};
     const int untilOneThread = ThreadChoice::RUN_LENGTH; // so that the last steps are on one thread
     return runTests({
         {"waters", [&] { testSameBits(makeWaters(), all, untilOneThread, false); }},

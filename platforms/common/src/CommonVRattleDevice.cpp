@@ -49,8 +49,8 @@ DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
 
 DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
     const double halfStepValue = settings.isAutomatic ? 0.0 : vrattle.findHalfStepValue();
-    const VRattleDynamics::Memory memory = vrattle.getMemory();
-    DeviceSteps::State state = {memory.density, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
+    const StepMemory memory = vrattle.getMemory();
+    DeviceSteps::State state = {memory.rho, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
     if (settings.isAutomatic) {
         state.automatic = memory.automatic;
         std::copy(memory.references.begin(), memory.references.end(), state.references);
@@ -58,18 +58,24 @@ DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
     return state;
 }
 
+StepMemory CommonVRattleDevice::memoryOf(const DeviceSteps::State& others) const {
+    StepMemory memory;
+    memory.rho = others.density;
+    memory.densityOffset = others.densityOffset;
+    memory.hasHalfStepValue = others.hasHalfStepValue;
+    memory.halfStepValue = others.halfStepValue;
+    static_cast<AutomaticRecursions::AutomaticNumbers&>(memory.automatic) = others.automatic;
+    memory.references = referencesOf(others);
+    return memory;
+}
+
 void CommonVRattleDevice::adopt(const State& state, const DeviceSteps::State& others) {
-    if (settings.isAutomatic)
-        vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.density,
-                      others.automatic, referencesOf(others));
-    else
-        vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.density,
-                      others.hasHalfStepValue ? &others.halfStepValue : nullptr, others.densityOffset);
+    vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, memoryOf(others));
 }
 
 void CommonVRattleDevice::carryOn(const DeviceSteps::State& others) {
     if (settings.isAutomatic)
-        vrattle.adopt(others.density, others.automatic, referencesOf(others));
+        vrattle.adopt(memoryOf(others));
 }
 
 // What a CMMotionRemover takes away is nothing to speak of for automatic step control, which would have to look at all velocities again.

@@ -28,6 +28,7 @@ protected:
     void adopt(const State& state, const DeviceSteps::State& others) override;
     void carryOn(const DeviceSteps::State& others) override;
     bool doesFrameMatter() override;
+    StepMemory memoryOf(const DeviceSteps::State& others) const;
 };
 
 } // namespace OpenMMVRattle

@@ -1,7 +1,7 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// The steps on a device against VRattleDynamics, from the same state in the middle of a run.
+// The steps on a device against VRattleRun, from the same state in the middle of a run.
 
 #include "DeviceSteps.h"
 #include "ExpressionCode.h"
@@ -13,8 +13,8 @@
 #include "openmm/Integrator.h"
 #include "openmm/internal/ContextImpl.h"
 #include "openmm/opencl/OpenCLPlatform.h"
+#include "run/VRattleRun.h"
 #include "step/LangevinDynamics.h"
-#include "step/VRattleDynamics.h"
 #include <cmath>
 #include <memory>
 #include <random>
@@ -168,13 +168,13 @@ double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
 
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
-// VRattleDynamics and DeviceSteps side by side; both get their forces from one Context on OpenCL.
+// VRattleRun and DeviceSteps side by side; both get their forces from one Context on OpenCL.
 struct Both {
     Lender lender;
     Context context;
-    VRattleDynamics dynamics;
+    VRattleRun dynamics;
     DeviceSteps device;
-    VRattleDynamics::Settings settings;
+    StepSettings settings;
 
     Both(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
@@ -208,7 +208,7 @@ struct Both {
         handOver();
     }
     void handOver() {
-        const VRattleDynamics::Memory memory = dynamics.getMemory();
+        const StepMemory memory = dynamics.getMemory();
         const double energy = groupEnergyAt(dynamics.getPositions());
         computeForces();
         context.setVelocities(dynamics.getVelocities());
@@ -219,7 +219,7 @@ struct Both {
             to.choice = dynamics.getAutomaticControl().getChoice();
             to.numDegreesOfFreedom = dynamics.getAutomaticControl().getNumDegreesOfFreedom();
             device.setSettings(to);
-            DeviceSteps::State state = {memory.density, 0, false, 0, memory.automatic};
+            DeviceSteps::State state = {memory.rho, 0, false, 0, memory.automatic};
             std::copy(memory.references.begin(), memory.references.end(), state.references);
             ASSERT(device.begin(state, energy));
             return;
@@ -230,8 +230,7 @@ struct Both {
         device.setSettings({settings.stepSize,
                             StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
                             settings.update, false, settings.tolerance, terms});
-        ASSERT(device.begin({memory.density, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue},
-                            energy));
+        ASSERT(device.begin({memory.rho, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue}, energy));
     }
     // To be asked for before the forces, which it overwrites.
     double groupEnergy() {
