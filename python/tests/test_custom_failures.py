@@ -152,15 +152,12 @@ def undisturbed_run(settings: str, failure: str, steps: int) -> Run:
 
 def cases() -> list[Any]:
     """Each failure with the settings and the next acts that can tell it from others."""
-    pairs = [(settings, failure, "nothing") for settings in SETTINGS for failure in FAILURES]
-    # Fixed steps cannot be calibrated.
-    pairs = [pair for pair in pairs if pair[0] != "fixed" or "calibration" not in pair[1]]
-    # What starts the density afresh or goes on with it, after every failure; the other settings after some.
-    pairs += [
-        ("default", failure, act) for failure in FAILURES for act in ("nominal step", "reference anew", "reverse")
-    ]
+    pairs = [("default", failure, act) for failure in FAILURES for act in ("nothing", "reverse")]
+    # The other programs, and what else the user may do, after those failures that leave a step at different places.
     some = ("in the first step", "in a later step", "in the shortened step", "no number in a later step")
-    pairs += [("reference", failure, act) for failure in some for act in NEXT if act != "nothing"]
+    pairs += [(settings, failure, "nothing") for settings in SETTINGS if settings != "default" for failure in some]
+    pairs += [("reference", "in the first step, tried again", "nothing")]
+    pairs += [("reference", failure, act) for failure in (some[0], some[-1]) for act in NEXT if act != "nothing"]
     return [pytest.param(*pair, id=", ".join(pair)) for pair in pairs]
 
 
