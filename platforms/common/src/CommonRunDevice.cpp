@@ -45,10 +45,11 @@ template <class Host>
 CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
                                        const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
-        compute(compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false), hasBegun(false),
-        isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0), stepsUntilLook(MANY_STEPS),
-        lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0), groupEnergy(0), hasForces(false),
-        writeCount(0), areAtomsReordered(true), reorderedStep(0), numDeviceRescues(0) {
+        compute(compute), actions(context, compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false),
+        hasBegun(false), isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0),
+        stepsUntilLook(MANY_STEPS), lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0),
+        groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true), reorderedStep(0),
+        numDeviceRescues(0) {
     // Too late where the Context's other integrators have initialized it already: then molecules that differ in expressions alone may
     // change places on the device, and the host takes the steps.
     const bool areKnown = settings.expressions.empty() || !compute.getEnergyBuffer().isInitialized();
@@ -188,7 +189,7 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
         settledCount = vectors->getStepCount();
     }
     ensureForces();
-    isOnHost = hasReport = false;
+    isOnHost = hasReport = isChangePending = false;
     lastMaxTime = maxTime;
     steps->advance(maxTime - vectors->getTime());
     numAsked++;
@@ -211,8 +212,10 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
 // After the positions of a step. The state before it is kept in the order that there was.
 template <class Host> void CommonRunDevice<Host>::reorderAtoms() {
     ContextSelector selector(compute);
-    const bool isDue = numAsked == 1 || compute.getStepsSinceReorder() >= STEPS_BETWEEN_REORDERINGS;
-    if (isDue && steps->hasFailed())
+    // Where no Force has a cutoff they stay in their order, and OpenMM counts on.
+    const bool isDue = compute.getNonbondedUtilities().getUseCutoff() &&
+                       (numAsked == 1 || compute.getStepsSinceReorder() >= STEPS_BETWEEN_REORDERINGS);
+    if (isDue && numAsked > 1 && steps->hasFailed())
         return; // an earlier state is to be put back
     if (isDue)
         lastOffsets = compute.getPosCellOffsets();
@@ -262,18 +265,36 @@ template <class Host> void CommonRunDevice<Host>::settle() {
     while (numAsked > 0) {
         const int asked = numAsked;
         const DeviceSteps::Report report = steps->read();
+        const bool hasChangeFailed = report.hasFailed && report.numSteps == asked; // after the last step
+        isChangePending = false;
         accept(report);
+        if (hasChangeFailed)
+            hasBegun = hasReport = false;
         // What follows a step that has failed is done in vain, so where steps fail often the device is looked at often.
         stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MANY_STEPS);
-        if (!report.hasFailed)
-            return;
+        if (!report.hasFailed || hasChangeFailed)
+            break;
         // The step that failed is left to the host, which has other means, and says what is wrong if they fail too.
         context.computeVirtualSites();
         takeToHost();
         Host::step(lastMaxTime);
-        for (int i = report.numSteps + 1; i < asked; i++)
+        for (int i = report.numSteps + 1; i < asked; i++) {
+            repeatActions();
             step(NO_LIMIT);
+        }
     }
+    if (isChangePending)
+        resolveChange();
+}
+
+// What Forces have done before a step that has not happened.
+template <class Host> void CommonRunDevice<Host>::repeatActions() {
+    if (!reach.hasThermostat && !reach.movesFrame)
+        return;
+    actions.repeat();
+    haveActed = true;
+    if (findChange() == RunDevice::Change::Velocities)
+        changeVelocities();
 }
 
 // ------------------------------------------------------------------------------------------------------ what has changed
@@ -302,13 +323,14 @@ template <class Host> void CommonRunDevice<Host>::setReferences(const vector<dou
 }
 
 template <class Host> bool CommonRunDevice<Host>::updateState() {
-    // What changes positions must not find those of a step that has failed.
-    if (reach.hasBarostat)
+    // What changes positions must not find those of a step that has failed. Another integrator may have let barostats act.
+    if (reach.hasBarostat && (vectors->isSharedByIntegrators() || actions.isTrialNext()))
         settle();
     if (reach.hasThermostat && isOnDevice)
         steps->keepVelocities();
+    haveActed = true;
     try {
-        return Host::updateState();
+        return actions.update(isOnDevice && hasBegun ? &steps->getControl() : nullptr);
     }
     catch (...) {
         settle();
@@ -319,6 +341,8 @@ template <class Host> bool CommonRunDevice<Host>::updateState() {
 template <class Host> RunDevice::Change CommonRunDevice<Host>::findChange() {
     if (!isOnDevice || reach.isUnknown)
         return Host::findChange();
+    const bool mayBeOthers = haveActed;
+    haveActed = false;
     const OpenMM::Vec3* box = vectors->getBoxVectors();
     const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
     std::copy(box, box + 3, boxVectors);
@@ -329,7 +353,8 @@ template <class Host> RunDevice::Change CommonRunDevice<Host>::findChange() {
         return RunDevice::Change::State;
     // A uniform motion is of no concern to constraints and their forces.
     const bool isOtherFrame = reach.movesFrame && doesFrameMatter();
-    return reach.hasThermostat || isOtherFrame ? RunDevice::Change::Velocities : RunDevice::Change::None;
+    return mayBeOthers && (reach.hasThermostat || isOtherFrame) ? RunDevice::Change::Velocities
+                                                                : RunDevice::Change::None;
 }
 
 // The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
@@ -372,9 +397,8 @@ template <class Host> void CommonRunDevice<Host>::changeState() {
         return;
     }
     computeForces();
-    hasBegun = steps->change(groupEnergy, Control::AllChanged);
-    knownCount = vectors->getStepCount();
-    readState();
+    changeOnDevice(Control::AllChanged);
+    settle();
 }
 
 template <class Host> void CommonRunDevice<Host>::changeForces() {
@@ -386,30 +410,36 @@ template <class Host> void CommonRunDevice<Host>::changeForces() {
         return;
     }
     computeForces();
-    hasBegun = steps->change(groupEnergy, Control::ForcesChanged);
-    knownCount = vectors->getStepCount();
-    readState();
+    changeOnDevice(Control::ForcesChanged);
+    settle();
 }
 
+// Does not wait for the device where the next step is taken there.
 template <class Host> void CommonRunDevice<Host>::changeVelocities() {
-    settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
         Host::changeVelocities();
         return;
     }
     ensureForces();
-    hasBegun = steps->change(groupEnergy, Control::VelocitiesChanged);
-    readState();
+    changeOnDevice(Control::VelocitiesChanged);
 }
 
-// After a change; where it has failed, the host will say why.
-template <class Host> void CommonRunDevice<Host>::readState() {
-    isOnHost = false;
-    hasReport = hasBegun;
+template <class Host> void CommonRunDevice<Host>::changeOnDevice(Control::Change change) {
+    steps->change(groupEnergy, change);
+    knownCount = vectors->getStepCount();
+    isChangePending = true;
+    isOnHost = hasReport = false;
+}
+
+// Of a change that no step has followed; where it has failed, the host will say why.
+template <class Host> void CommonRunDevice<Host>::resolveChange() {
+    isChangePending = false;
+    const DeviceSteps::Report report = steps->read();
+    hasBegun = hasReport = !report.hasFailed;
     if (!hasBegun)
         return;
-    lastReport = steps->read();
+    lastReport = report;
     state = lastReport.state;
 }
 

@@ -6,6 +6,7 @@
 
 #include "DeviceSteps.h"
 #include "ExpressionInfo.h"
+#include "ForceActions.h"
 #include "openmm/internal/ContextImpl.h"
 #include "run/RunDevice.h"
 #include "run/RunState.h"
@@ -99,7 +100,9 @@ private:
     bool areForcesValid();
     void ensureForces();
     int getNumWrites() const;
-    void readState();
+    void changeOnDevice(Control::Change change);
+    void resolveChange();
+    void repeatActions();
     void setDeviceParameters();
     void beginOnDevice();
     void stepOnDevice(double maxTime);
@@ -108,6 +111,7 @@ private:
     void restoreOrder();
     OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
+    ForceActions actions;
     ExpressionInfo* expressionInfo;     // of the Context, or null
     std::unique_ptr<DeviceSteps> steps; // none where the host takes them all
     DeviceSteps::State state; // of the device when it was read last
@@ -116,6 +120,8 @@ private:
     bool hasBegun;      // the device has what it needs for the next step
     bool isOnHost;      // the host's state is the same
     bool areSettingsOnDevice, hasReport;
+    bool isChangePending = false; // since the last step; whether the device could go on with it nobody has looked at
+    bool haveActed = false;       // Forces, since the last look for a change
     bool hasStepped = false; // by the last step()
     int numAsked;       // steps since the last settle()
     int stepsUntilLook; // how many there may be

@@ -19,6 +19,8 @@ const int FEWEST_TRIALS = 3, MOST_TRIALS = 6;
 const double NO_LIMIT = 1e30;
 // A step that is none: the state was changed by others.
 const int NO_STEP = -1;
+// For how many steps ago one has failed; a change of the state after the last step has -1.
+const int NO_FAILURE = -2;
 // What rounding allows: of the constraints and of (3.14).
 const double SINGLE_TOLERANCE = 1e-5, MIXED_TOLERANCE = 1e-12, DOUBLE_TOLERANCE = 1e-13;
 const double SINGLE_DENSITY_TOLERANCE = 3e-6, DENSITY_TOLERANCE = 1e-12;
@@ -300,7 +302,7 @@ void DeviceSteps::setArguments(Kernels& created) {
     addState(created.finish);
     addLastState(created.finish);
 
-    addEmpty(created.evaluate, 5); // step, isRescaled, groupEnergy, numPartials, control
+    addEmpty(created.evaluate, 6); // step, change, isReported, groupEnergy, numPartials, control
     created.evaluate->addArg(settingsArray);
     created.evaluate->addArg(partials);
     created.evaluate->addArg(failure);
@@ -474,12 +476,13 @@ void DeviceSteps::launchFinish(int step, double kick, Control::Change change, bo
     launchLarge(kernels.finishLarge, step, numProjections + (program->hasHalfSums() ? 3 : 2));
 }
 
-void DeviceSteps::launchEvaluate(int step, Control::Change change) {
+void DeviceSteps::launchEvaluate(int step, Control::Change change, bool isReported) {
     kernels.evaluate->setArg(0, step);
     kernels.evaluate->setArg(1, (int) change);
-    setWide(kernels.evaluate, 2, groupEnergy);
-    kernels.evaluate->setArg(3, numPartials);
-    kernels.evaluate->setArg(4, control[half]);
+    kernels.evaluate->setArg(2, (int) isReported);
+    setWide(kernels.evaluate, 3, groupEnergy);
+    kernels.evaluate->setArg(4, numPartials);
+    kernels.evaluate->setArg(5, control[half]);
     kernels.evaluate->execute(groupSize, groupSize);
     numLaunches++;
 }
@@ -515,8 +518,12 @@ bool DeviceSteps::begin(const State& state, double energy) {
     elapsedRead = 0;
     groupEnergy = energy;
     launchFinish(NO_STEP, 0, Control::AllChanged, false);
-    launchEvaluate(NO_STEP, Control::NothingChanged);
-    return !hasChangeFailed();
+    launchEvaluate(NO_STEP, Control::NothingChanged, true);
+    // Such a failure leaves nothing to put back.
+    if (readReport()[program->getControlSize()] == NO_FAILURE)
+        return true;
+    clearFailure();
+    return false;
 }
 
 void DeviceSteps::keepVelocities() {
@@ -527,26 +534,26 @@ void DeviceSteps::keepVelocities() {
     areVelocitiesKept = true;
 }
 
-bool DeviceSteps::change(double energy, Control::Change change) {
+// A failure is one of the next step, whose advanceStep copies the state and is then put back.
+void DeviceSteps::change(double energy, Control::Change change) {
     OpenMM::ContextSelector selector(context);
     if (!areVelocitiesKept)
         keepVelocities();
     areVelocitiesKept = false;
-    launchEvaluate(NO_STEP, Control::NothingChanged); // u before the change
+    launchEvaluate(stepNumber, Control::NothingChanged, false); // u before the change
     groupEnergy = energy;
-    launchFinish(NO_STEP, 0, change, true);
-    launchEvaluate(NO_STEP, change);
-    return !hasChangeFailed();
+    launchFinish(stepNumber + 1, 0, change, true);
+    launchEvaluate(stepNumber + 1, change, false);
 }
 
-// Of a change; such a failure leaves nothing to put back.
-bool DeviceSteps::hasChangeFailed() {
+vector<double> DeviceSteps::readReport() {
     vector<double> block;
     reportArray.download(block, true);
-    if (block[block.size() - 2] < 0)
-        return false;
+    return block;
+}
+
+void DeviceSteps::clearFailure() {
     failure.upload(vector<int>{0, 0});
-    return true;
 }
 
 void DeviceSteps::advance(double maxStep) {
@@ -608,16 +615,20 @@ void DeviceSteps::finish(double energy) {
 
 DeviceSteps::Report DeviceSteps::read() {
     OpenMM::ContextSelector selector(context);
-    launchEvaluate(stepNumber, Control::NothingChanged);
-    vector<double> block;
-    reportArray.download(block, true);
+    launchEvaluate(stepNumber, Control::NothingChanged, true);
+    const vector<double> block = readReport();
     const int stepsSinceFailure = (int) std::lround(block[block.size() - 2]), code = (int) std::lround(block.back());
     // (The monitors of large clusters, whose factors are in single precision, scatter by more, and take what there is.)
     if (large.isEmpty())
         numTrials =
             std::min(MOST_TRIALS, std::max({FEWEST_TRIALS, numTrials - 1, (int) block[Control::MostTrials] + 1}));
-    if (stepsSinceFailure < 0)
-        return fill(block);
+    if (stepsSinceFailure < 0) { // of a change after the last step, that there is nothing to put back of
+        Report report = fill(block);
+        report.hasFailed = stepsSinceFailure != NO_FAILURE;
+        if (report.hasFailed)
+            clearFailure();
+        return report;
+    }
     // The sums are those of the state put back, unless its step got as far as to leave others.
     const bool hasSums = code == Control::NotConverged || code == Control::UnsolvedDensity;
     if (code == Control::UnsolvedDensity)
@@ -644,13 +655,13 @@ DeviceSteps::Report DeviceSteps::undo(int numSteps, bool hasSums) {
     kernels.restore->execute(context.getNumAtoms());
     if (numSteps % 2 == 1)
         half = 1 - half;
-    failure.upload(vector<int>{0, 0});
+    clearFailure();
     if (hasSums)
-        launchEvaluate(NO_STEP, Control::NothingChanged);
+        launchEvaluate(NO_STEP, Control::NothingChanged, false);
     vector<double> block;
     control[half].download(block, true);
     // The end of the step before may have been looked at by the step that has failed alone, which leaves other sums.
-    if (settings.isAutomatic) {
+    if (settings.isAutomatic && block[Control::IsAccepted] == 0) {
         vector<double> next;
         control[1 - half].download(next, true);
         std::copy(next.begin() + Control::FirstReference, next.end(), block.begin() + Control::FirstReference);

@@ -25,7 +25,7 @@ namespace OpenMMVRattle {
  *
  * A step of Langevin dynamics whose end asks for substeps has failed, which the next one notices.
  *
- * Nothing here waits for the device but read(), putBack() and what changes settings.
+ * Nothing here waits for the device but begin(), read(), putBack() and what changes settings.
  */
 class DeviceSteps {
 public:
@@ -93,9 +93,10 @@ public:
     bool begin(const State& state, double groupEnergy);
     /**
      * Go on from positions, velocities and forces that are others now, or some of them: velocities are projected, the density is
-     * scaled with u. With automatic step control it matters what the velocities were, see keepVelocities().
+     * scaled with u. With automatic step control it matters what the velocities were, see keepVelocities(). Does not wait for the
+     * device: where it fails the next step does, and where read() comes before that it says so, and begin() is due.
      */
-    bool change(double groupEnergy, Control::Change change);
+    void change(double groupEnergy, Control::Change change);
     /** Remember the velocities, which others are about to change. Does nothing where it does not matter. */
     void keepVelocities();
 
@@ -114,6 +115,10 @@ public:
     bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
     long long getNumIterations();
+    /** What is known on the device of the last step, in the order of Control::Field. */
+    OpenMM::ComputeArray& getControl() {
+        return control[half];
+    }
     const LargeClusters& getLargeClusters() const {
         return large;
     }
@@ -155,8 +160,9 @@ private:
     int getNumProjections() const;
     void launchLarge(OpenMM::ComputeKernel& kernel, int step, int numStages);
     void launchFinish(int step, double kick, Control::Change change, bool isStored);
-    void launchEvaluate(int step, Control::Change change);
-    bool hasChangeFailed();
+    void launchEvaluate(int step, Control::Change change, bool isReported);
+    std::vector<double> readReport();
+    void clearFailure();
     Report undo(int numSteps, bool hasSums);
     Report fill(const std::vector<double>& block);
     OpenMM::ComputeContext& context;

@@ -43,7 +43,7 @@ struct Waters {
         const double edge = 2.4;
         system.setDefaultPeriodicBoxVectors(Vec3(edge, 0, 0), Vec3(0.3, edge, 0), Vec3(-0.2, 0.4, edge));
         nonbonded->setNonbondedMethod(NonbondedForce::CutoffPeriodic);
-        nonbonded->setCutoffDistance(0.9);
+        nonbonded->setCutoffDistance(0.88); // at 0.9 nm are pairs that rounding decides about
         nonbonded->setUseSwitchingFunction(true);
         nonbonded->setSwitchingDistance(0.7);
         std::mt19937 random(11);
@@ -143,8 +143,12 @@ void testAgreement() {
     for (int chain : {0, 12}) {
         const Waters t(chain == 0 ? 48 : 8, chain);
         Run there(t, reference()), here(t, getTestPlatform());
-        there.begin(t);
-        there.integrator.step(100);
+        for (Run* each : {&there, &here}) {
+            each->begin(t);
+            each->integrator.step(1); // which the host takes
+        }
+        ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-9, 1e-6, 1e-5));
+        there.integrator.step(99);
         const std::string xml = there.save();
         there.load(xml);
         here.load(xml);
@@ -192,7 +196,8 @@ void testClash() {
 // Steps that turn out to need substeps when many more have been asked for, among them one after which the atoms were reordered: with the
 // reference a little above U, that is so again and again.
 void testSubstepsInBetween() {
-    const Waters t(27);
+    Waters t(27);
+    t.system.addForce(new CMMotionRemover(1)); // what it does before steps that are taken again is done again
     Run there(t, reference()), here(t, getTestPlatform());
     there.begin(t);
     there.integrator.step(20);

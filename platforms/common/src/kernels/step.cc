@@ -213,12 +213,14 @@ inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL c
 }
 
 // A failure is written down as the number of its step and a code, and from then on no launch of a later step does anything. The
-// launches of the same step may see it come or not: what they write is put back.
+// launches of the same step may see it come or not: what they write is put back. Of two the first counts.
 #define IS_FROZEN(failure, step) ((failure)[0] != 0 && (failure)[0] != (step))
 
 inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
-    failure[0] = step;
-    failure[1] = code;
+    if (failure[0] == 0) {
+        failure[0] = step;
+        failure[1] = code;
+    }
 }
 
 #define STATE_PARAMETERS int numSlots, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed* RESTRICT lengths, \
@@ -342,11 +344,11 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
 }
 
 /**
- * Evaluate the monitors at the on-step state, for the host to read; of one work group. Where others have changed it (change is not 0)
- * the density keeps its ratio to u. A monitor that is no number makes the step that has led here fail. The report is the control
- * block and behind it how many steps ago one has failed (-1 for none) and why.
+ * Evaluate the monitors at the on-step state; of one work group. Where others have changed it (change is not 0) the density keeps its
+ * ratio to u. A monitor that is no number makes this step fail: that which has led here, or if others have changed the state the next.
+ * The report for the host is the control block and behind it how many steps ago one has failed (-2 for none) and why.
  */
-KERNEL void evaluateState(int step, int change, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
+KERNEL void evaluateState(int step, int change, int isReported, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
         GLOBAL const mixed* RESTRICT partials, GLOBAL int* RESTRICT failure, GLOBAL wide* RESTRICT report) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
@@ -383,10 +385,10 @@ KERNEL void evaluateState(int step, int change, wide groupEnergy, int numPartial
         }
     }
 #endif
-    if (LOCAL_ID == 0) {
+    if (LOCAL_ID == 0 && isReported != 0) {
         for (int i = 0; i < CONTROL_SIZE; i++)
             report[i] = control[i];
-        report[CONTROL_SIZE] = (failure[0] != 0 ? step - failure[0] : -1);
+        report[CONTROL_SIZE] = (failure[0] != 0 ? step - failure[0] : -2);
         report[CONTROL_SIZE + 1] = failure[1] % NUM_CODES;
         control[MOST_TRIALS] = 0;
     }
