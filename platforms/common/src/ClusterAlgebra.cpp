@@ -84,11 +84,11 @@ string ClusterAlgebra::lower(int i, int j) const {
 
 string ClusterAlgebra::writeFactorize() const {
     const int n = (int) pairs.size();
-    string text =
-        "inline DEVICE bool factorize_KIND(mixed (*r)[3], mixed* w, mixed* L) {\n    bool isRegular = true;\n";
+    string text = "inline DEVICE bool factorize_KIND(VECTORS r, mixed* w, mixed* L) {\n    bool isRegular = true;\n";
     auto product = [&](int i, int j) {
         const string w = weight(order[i], order[j]);
-        return w.empty() ? string("0") : w + "*dot3(" + at("r", order[i]) + ", " + at("r", order[j]) + ")";
+        return w.empty() ? string("0")
+                         : w + "*dotEachOther_KIND(r, " + to_string(order[i]) + ", " + to_string(order[j]) + ")";
     };
     for (int p = 0; p < n; p++)
         for (int i = p; i < n; i++)
@@ -128,16 +128,16 @@ string ClusterAlgebra::writeSolve() const {
 
 string ClusterAlgebra::writeNewton() const {
     const int n = (int) pairs.size();
-    string text = "inline DEVICE void newton_KIND(mixed (*s)[3], mixed (*r)[3], mixed* w, mixed* b) {\n";
+    string text = "inline DEVICE void newton_KIND(mixed (*s)[3], VECTORS r, mixed* w, mixed* b) {\n";
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             if (isEntry(i, j)) {
                 const string w = weight(order[i], order[j]);
-                text +=
-                    "    FACTOR " + at("A", i, j) + " = " +
-                    (w.empty() ? string("0")
-                               : "(FACTOR) (" + w + "*dot3(" + at("s", order[i]) + ", " + at("r", order[j]) + "))") +
-                    ";\n";
+                text += "    FACTOR " + at("A", i, j) + " = " +
+                        (w.empty() ? string("0")
+                                   : "(FACTOR) (" + w + "*dotVector_KIND(r, " + to_string(order[j]) + ", " +
+                                         at("s", order[i]) + "))") +
+                        ";\n";
             }
     for (int p = 0; p < n; p++) {
         text += "    " + at("A", p, p) + " = 1/" + at("A", p, p) + ";\n";
@@ -162,13 +162,13 @@ string ClusterAlgebra::writeNewton() const {
 
 string ClusterAlgebra::writeMove() const {
     const int n = (int) pairs.size();
-    string text = "inline DEVICE void move_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed (*s)[3]) {\n";
+    string text = "inline DEVICE void move_KIND(VECTORS r, mixed* w, mixed* x, mixed (*s)[3]) {\n";
     for (int k = 0; k < n; k++)
         for (int l = 0; l < n; l++) {
             const string w = weight(k, l);
             if (!w.empty())
                 text += "    UNROLL for (int d = 0; d < 3; d++)\n        " + at("s", k) + "[d] += " + w + "*" +
-                        at("x", l) + "*" + at("r", l) + "[d];\n";
+                        at("x", l) + "*r[(" + to_string(3 * l) + " + d)*STRIDE];\n";
         }
     return text + "}\n";
 }

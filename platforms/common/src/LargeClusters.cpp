@@ -261,7 +261,7 @@ struct LargeClusters::Layout {
 };
 
 LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& limits) :
-        form(), numThreads(limits.numThreads), narrow(limits.narrow) {
+        form(), numThreads(limits.numThreads), narrow(limits.narrow), localMemory(limits.localMemory) {
     size_t total = 0;
     for (const ClusterKind& kind : kinds)
         if ((double) kind.pairs.size() > WHOLE * limits.pieceSize)

@@ -103,6 +103,10 @@ public:
     int getNarrow() const {
         return narrow;
     }
+    /** What there is of local memory for a work group, in bytes. */
+    int getLocalMemory() const {
+        return localMemory;
+    }
     /** The largest numbers among the pieces: levels, entries of the factor below the diagonal, joints of a cluster. */
     int getNumLevels() const {
         return numLevels;
@@ -130,7 +134,7 @@ private:
     std::vector<Row> rows, joints;
     std::vector<double> rowLengths, jointLengths;
     std::vector<int> atoms;
-    int numConstraints, numThreads, narrow, localSize, numLevels, numJoints, numJointLevels;
+    int numConstraints, numThreads, narrow, localMemory, localSize, numLevels, numJoints, numJointLevels;
     size_t numFactors, numWork, numWords, numEntries;
 };
 

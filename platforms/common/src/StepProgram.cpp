@@ -19,6 +19,7 @@ using std::vector;
 namespace {
 
 const int MANY_ENTRIES = 16; // of the matrix of Newton's iteration
+const int MOST_IN_REGISTERS = 6; // constraints; of more the distance vectors are in local memory
 const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
 // Of a part with expressions: where so many chord iterations do not converge Newton's follow.
 const int MAX_CHORD_ITERATIONS = 12, MAX_PART_ITERATIONS = 100;
@@ -154,8 +155,9 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
     if (areShared)
         defines["NUM_THREADS"] = to_string(numThreads);
     writeMonitors(terms);
-    writeClusters(kinds);
-    writeLargeClusters(large);
+    const int bytesOfGroup = getGroupSize(areShared) * (isMixed ? 8 : 4); // for one number of each thread
+    const int numKept = writeClusters(kinds, large.getLocalMemory() / bytesOfGroup);
+    writeLargeClusters(large, numKept * bytesOfGroup);
     words["EXPRESSION_CLUSTERS"] = "";
     if (expressions != nullptr)
         writeExpressions(*expressions);
@@ -337,10 +339,11 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
     words["POWER_FUNCTIONS"] = powers;
 }
 
-void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
+// Returns how many numbers of a thread are in local memory, of those for which there is room.
+int StepProgram::writeClusters(const vector<ClusterKind>& kinds, int mostKept) {
     string functions, finishCases, trialCases, advanceCases;
     numSlots = 0;
-    int numAtoms = 0, numLengths = 0;
+    int numAtoms = 0, numLengths = 0, numKept = 0;
     for (size_t i = 0; i < kinds.size(); i++) {
         const ClusterKind& kind = kinds[i];
         const int count = (int) kind.atoms.size(), numConstraints = (int) kind.pairs.size();
@@ -354,12 +357,22 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
                 first += (first.empty() ? "" : ", ") + to_string(pair.first);
                 second += (second.empty() ? "" : ", ") + to_string(pair.second);
             }
-            text.erase(0, text.find("\nCLUSTER_ALGEBRA\n") + 17); // the explanation
-            text = algebra.write() + text;
+            text.erase(0, text.find("\ninline ") + 1); // the explanation
+            replaceAll(text, "CLUSTER_ALGEBRA", algebra.write());
             replaceAll(text, "FIRST_ATOMS", "{" + first + "}");
             replaceAll(text, "SECOND_ATOMS", "{" + second + "}");
-            // A matrix of many entries, whose rounding another iteration mends, takes half the registers in the type of forces.
-            replaceAll(text, "FACTOR", 2 * algebra.getNumEntries() - numConstraints > MANY_ENTRIES ? "real" : "mixed");
+            // A matrix of many entries, whose rounding another iteration mends, takes half the registers in single precision, or
+            // in the type of forces.
+            const bool isInLocalMemory = numConstraints > MOST_IN_REGISTERS && 4 * numConstraints <= mostKept;
+            const bool areMany = 2 * algebra.getNumEntries() - numConstraints > MANY_ENTRIES;
+            replaceAll(text, "FACTOR", !areMany ? "mixed" : isInLocalMemory ? "float" : "real");
+            replaceAll(text, "MAKE_VECTORS",
+                       isInLocalMemory ? "VECTORS r = kept + LOCAL_ID;" : "mixed r[4*NUM_CONSTRAINTS];");
+            replaceAll(text, "VECTORS", isInLocalMemory ? "LOCAL_ARG volatile mixed*" : "mixed*");
+            replaceAll(text, "LEAVES_MIDDLE", isInLocalMemory ? "true" : "false");
+            replaceAll(text, "STRIDE", isInLocalMemory ? "GROUP_SIZE" : "1");
+            if (isInLocalMemory)
+                numKept = std::max(numKept, 4 * numConstraints);
             replaceAll(text, "NUM_ENTRIES", to_string(algebra.getNumEntries()));
         }
         for (const auto& word : map<string, int>{{"NUM_ATOMS", kind.numAtoms},
@@ -388,13 +401,15 @@ void StepProgram::writeClusters(const vector<ClusterKind>& kinds) {
         numAtoms += count * kind.numAtoms;
         numLengths += count * numConstraints;
     }
+    defines["NUM_KEPT"] = to_string(numKept);
     words["CLUSTER_FUNCTIONS"] = functions;
     words["FINISH_CASES"] = finishCases;
     words["TRIAL_CASES"] = trialCases;
     words["ADVANCE_CASES"] = advanceCases;
+    return numKept;
 }
 
-void StepProgram::writeLargeClusters(const LargeClusters& large) {
+void StepProgram::writeLargeClusters(const LargeClusters& large, int bytesKept) {
     const LargeClusters::Form& form = large.getForm();
     words["LARGE_CLUSTERS"] =
         large.isEmpty() ? "#define FUSED_PARAMETERS\n#define FUSED_MEMORY\n" : DeviceSources::large;
@@ -409,7 +424,9 @@ void StepProgram::writeLargeClusters(const LargeClusters& large) {
     defines["HAS_JOINTS"] = form.hasJoints ? "1" : "0";
     defines["IN_LOCAL_MEMORY"] = form.isInLocalMemory ? "1" : "0";
     defines["MEMORY"] = form.isInLocalMemory ? "LOCAL_ARG" : "GLOBAL";
-    defines["SHARED_SIZE"] = to_string(form.isInLocalMemory ? large.getLocalSize() : 1);
+    // Groups of a launch that have no piece keep the vectors of small clusters there.
+    const int wordsKept = form.isFused ? bytesKept / 16 : 0;
+    defines["SHARED_SIZE"] = to_string(form.isInLocalMemory ? std::max(large.getLocalSize(), wordsKept) : 1);
     defines["NARROW"] = hasNarrow ? to_string(large.getNarrow()) : "NUM_THREADS";
     defines["SYNC_NARROW"] = hasNarrow ? "__syncwarp()" : "SYNC_PIECE";
     defines["MAX_POLLS"] = to_string(form.isStaged ? 1 : MAX_POLLS);

@@ -141,8 +141,8 @@ public:
 
 private:
     void writeMonitors(const std::vector<StepMonitor::Term>& terms);
-    void writeClusters(const std::vector<ClusterKind>& kinds);
-    void writeLargeClusters(const LargeClusters& large);
+    int writeClusters(const std::vector<ClusterKind>& kinds, int mostKept);
+    void writeLargeClusters(const LargeClusters& large, int bytesKept);
     void writeAutomaticControl(int numPieces);
     void writeExpressions(const ExpressionClusters& expressions);
     std::string source;

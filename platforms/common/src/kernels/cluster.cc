@@ -10,23 +10,34 @@
 //     newton_KIND(s, r, w, b): b <- A^-1 b with the rows s[k] on the left: A[k][l] = s[k] . M^-1 r[l]
 //     move_KIND(r, w, x, s):   s[k] += (the change of the distance vector of k by the displacements M^-1 G^T x)
 //
-// Constraints are g = (|r|^2 - L^2)/2, so that a row of G is r on the first particle and -r on the second.
+// Constraints are g = (|r|^2 - L^2)/2, so that a row of G is r on the first particle and -r on the second. r[(3*k + d)*STRIDE] are the
+// components of r[k], in registers, or in local memory where there are more constraints than registers have room for; behind them are
+// the multipliers gamma while they are found.
+
+inline DEVICE mixed dotVector_KIND(VECTORS r, int k, const mixed* a) {
+    return r[3*k*STRIDE]*a[0] + r[(3*k + 1)*STRIDE]*a[1] + r[(3*k + 2)*STRIDE]*a[2];
+}
+
+inline DEVICE mixed dotEachOther_KIND(VECTORS r, int k, int l) {
+    const mixed a[3] = {r[3*l*STRIDE], r[(3*l + 1)*STRIDE], r[(3*l + 2)*STRIDE]};
+    return dotVector_KIND(r, k, a);
+}
 
 CLUSTER_ALGEBRA
 
 /** The distance vectors of the constraints. */
-inline DEVICE void loadVectors_KIND(int c, GLOBAL const int* RESTRICT atoms, GLOBAL const real4* RESTRICT posq, GLOBAL const real4* RESTRICT posqCorrection, mixed (*r)[3]) {
+inline DEVICE void loadVectors_KIND(int c, GLOBAL const int* RESTRICT atoms, GLOBAL const real4* RESTRICT posq, GLOBAL const real4* RESTRICT posqCorrection, VECTORS r) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed x[NUM_ATOMS][3];
     UNROLL for (int i = 0; i < NUM_ATOMS; i++)
         loadPosition(posq, posqCorrection, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], x[i]);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         UNROLL for (int d = 0; d < 3; d++)
-            r[k][d] = x[first[k]][d] - x[second[k]][d];
+            r[(3*k + d)*STRIDE] = x[first[k]][d] - x[second[k]][d];
 }
 
 /** Lambda(q,v) (4.3), and the terms of the monitors there. */
-inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mm_long* force, mixed (*r)[3], mixed* L, mixed (*v)[3], mixed* w,
+inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mm_long* force, VECTORS r, mixed* L, mixed (*v)[3], mixed* w,
         mixed* lambda, mixed* sums) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed rightSide[NUM_CONSTRAINTS];
@@ -43,9 +54,9 @@ inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RES
         addParticleTerms(sums, forceSquared, w[i], v[i]);
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
             if (first[k] == i)
-                rightSide[k] += dot3(r[k], a);
+                rightSide[k] += dotVector_KIND(r, k, a);
             if (second[k] == i)
-                rightSide[k] -= dot3(r[k], a);
+                rightSide[k] -= dotVector_KIND(r, k, a);
         }
     }
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
@@ -56,14 +67,25 @@ inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RES
 }
 
 /** v += factor M^-1 G^T x */
-inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mixed (*v)[3]) {
+inline DEVICE void push_KIND(VECTORS r, mixed* w, mixed* x, mixed factor, mixed (*v)[3]) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         UNROLL for (int d = 0; d < 3; d++) {
-            const mixed impulse = factor*x[k]*r[k][d];
+            const mixed impulse = factor*x[k]*r[(3*k + d)*STRIDE];
             v[first[k]][d] += w[first[k]]*impulse;
             v[second[k]][d] -= w[second[k]]*impulse;
         }
+}
+
+/** M^-1 (F - G^T Lambda) of a particle; returns what loadAcceleration() does. */
+inline DEVICE mixed loadNetAcceleration_KIND(int i, GLOBAL const mm_long* force, int paddedNumAtoms, int atom, VECTORS r, mixed w, const mixed* lambda, mixed* a) {
+    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
+    const mixed forceSquared = loadAcceleration(force, paddedNumAtoms, atom, w, a);
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+        if (first[k] == i || second[k] == i)
+            UNROLL for (int d = 0; d < 3; d++)
+                a[d] += (first[k] == i ? -w : w)*lambda[k]*r[(3*k + d)*STRIDE];
+    return forceSquared;
 }
 
 // Registers are what clusters of many constraints lack. So what is needed again after a solution is read AGAIN and not kept, and those of
@@ -72,30 +94,30 @@ inline DEVICE void push_KIND(mixed (*r)[3], mixed* w, mixed* x, mixed factor, mi
 /** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
 inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], x1[NUM_CONSTRAINTS];
+    MAKE_VECTORS
+    mixed v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], x1[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
     bool isRegular = true;
-#if UPDATE == AUTOMATIC
-    mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
-#endif
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         mixed a[3];
-        const bool isReady = (NUM_CONSTRAINTS > 5 && (i == 0 ? r[0][0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        const bool isReady = (NUM_CONSTRAINTS > 5 && (i == 0 ? (mixed) r[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         isRegular = loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a) >= 0 && isRegular;
-#if UPDATE == AUTOMATIC
-        followForce(terms, last, force, paddedNumAtoms, atom, w[i], v[i][0], v[i][1], v[i][2]);
-#endif
         UNROLL for (int d = 0; d < 3; d++)
             v[i][d] += kick*a[d];
     }
+#if UPDATE == AUTOMATIC // here or behind the right-hand side, wherever registers suffice
+    isRegular = factorize_KIND(r, w, L) && isRegular;
+#endif
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         x1[k] = 0;
         UNROLL for (int d = 0; d < 3; d++)
-            x1[k] += r[k][d]*(v[first[k]][d] - v[second[k]][d]);
+            x1[k] += r[(3*k + d)*STRIDE]*(v[first[k]][d] - v[second[k]][d]);
     }
+#if UPDATE != AUTOMATIC
     isRegular = factorize_KIND(r, w, L) && isRegular;
+#endif
     solve_KIND(L, x1);
     push_KIND(r, w, x1, -1, v);
     const bool isPushed = x1[0] > 0;
@@ -103,21 +125,22 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
         multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = x1[k];
 #if CLUSTER_SUMS
-    mixed net[NUM_ATOMS][3], share = 0; // M^-1 (F - G^T Lambda)
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 7 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]);
-    push_KIND(r, w, x1, -1, net);
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        share += shareOf(dot3(net[i], net[i]), w[i], v[i]);
+    mixed net[3] = {x1[0], 0, 0}, share = 0;
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], r, w[i], x1, net);
+        share += shareOf(dot3(net, net), w[i], v[i]);
+    }
     isRegular = addCluster(sums, share) && isRegular;
 #endif
 #if UPDATE == AUTOMATIC
-    mixed net[NUM_ATOMS][3]; // M^-1 (F - G^T Lambda)
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        addFlight(terms, loadAcceleration(AGAIN((i == 0 || NUM_CONSTRAINTS < 6 ? x1[0] : net[i == 0 ? 0 : i - 1][0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], net[i]), v[i]);
-    push_KIND(r, w, x1, -1, net);
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++)
-        addAutomaticTerms(terms, last, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], v[i], net[i]);
+    mixed net[3] = {x1[0], 0, 0}, terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+        const mixed4 before = AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, velm)[atom];
+        followForce(terms, last, force, paddedNumAtoms, atom, w[i], before.x, before.y, before.z);
+        addFlight(terms, loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atom, r, w[i], x1, net), v[i]);
+        addAutomaticTerms(terms, last, atom, w[i], v[i], net);
+    }
     addCluster(sums, terms, last, atoms[ATOM_BASE + c]);
 #endif
     // The on-step velocities go out, and those of the half step take their place.
@@ -163,13 +186,14 @@ inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* 
  * where it meets the tolerance.
  */
 inline DEVICE int constrain_KIND(int c, mixed kick, mixed dt, mixed tolerance, GLOBAL const mixed* RESTRICT lengths, GLOBAL const mixed* RESTRICT multipliers,
-        mixed (*r)[3], mixed* w, mixed (*v)[3], mixed* gamma) {
+        VECTORS r, mixed* w, mixed (*v)[3], mixed* gamma) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed s[NUM_CONSTRAINTS][3];
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         gamma[k] = -kick*dt*multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c];
+        r[(3*NUM_CONSTRAINTS + k)*STRIDE] = gamma[k];
         UNROLL for (int d = 0; d < 3; d++)
-            s[k][d] = r[k][d] + dt*(v[first[k]][d] - v[second[k]][d]);
+            s[k][d] = r[(3*k + d)*STRIDE] + dt*(v[first[k]][d] - v[second[k]][d]);
     }
     move_KIND(r, w, gamma, s);
     mixed previous = 1e30f;
@@ -191,18 +215,21 @@ inline DEVICE int constrain_KIND(int c, mixed kick, mixed dt, mixed tolerance, G
             previous = error;
             newton_KIND(s, r, w, g);
             UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-                gamma[k] += g[k];
+                r[(3*NUM_CONSTRAINTS + k)*STRIDE] += g[k];
             move_KIND(r, w, g, s);
         }
     }
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+        gamma[k] = r[(3*NUM_CONSTRAINTS + k)*STRIDE];
     return iterations;
 }
 
 /** The monitors at the half-step velocities of a step of size dt; returns false if there is no such step. */
 inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed* sums) {
-    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
+    MAKE_VECTORS
+    mixed v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
+    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0] > 0);
     loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt/2, w, v);
     const int iterations = constrain_KIND(c, dt/2, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) // where the next trial starts
@@ -220,7 +247,8 @@ inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed
  * iterations, or -1 if they do not converge.
  */
 inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities NOISE_PARAMETERS) {
-    mixed r[NUM_CONSTRAINTS][3], v[NUM_ATOMS][3], w[NUM_ATOMS], gamma[NUM_CONSTRAINTS];
+    MAKE_VECTORS
+    mixed v[NUM_ATOMS][3], w[NUM_ATOMS], gamma[NUM_CONSTRAINTS];
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         mixed x[3];
@@ -229,25 +257,36 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed t
         oldVelocities[atom] = velm[atom];
     }
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0][0] > 0);
+    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0] > 0);
     loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), kick, w, v);
     int iterations = constrain_KIND(c, kick, dt, tolerance, lengths, multipliers, r, w, v, gamma);
 #if UPDATE == LANGEVIN
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
     mixed middle[NUM_ATOMS][3];
+    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), kick, w, v);
     push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, middle[i]);
+        const bool isReady = (v[NUM_CONSTRAINTS < 6 || i == 0 ? 0 : i - 1][0] > 0);
+        const real charge = loadPosition(AGAIN(isReady, posq), AGAIN(isReady, posqCorrection), atom, middle[i]);
         UNROLL for (int d = 0; d < 3; d++)
             middle[i][d] += dt*v[i][d];
-        addNoise(noise, atomIndex[atom], w[i], v[i]);
+        if (LEAVES_MIDDLE)
+            storePosition(posq, posqCorrection, atom, middle[i][0], middle[i][1], middle[i][2], charge);
+        addNoise(noise, AGAIN(isReady, atomIndex)[atom], w[i], v[i]);
+        if (LEAVES_MIDDLE)
+            velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
     }
-    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-        UNROLL for (int d = 0; d < 3; d++)
-            r[k][d] = middle[first[k]][d] - middle[second[k]][d];
+    if (LEAVES_MIDDLE)
+        loadVectors_KIND(c, atoms, AGAIN(v[NUM_ATOMS - 1][0] > 0, posq), AGAIN(v[NUM_ATOMS - 1][0] > 0, posqCorrection), r);
+    else
+        UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+            UNROLL for (int d = 0; d < 3; d++)
+                r[(3*k + d)*STRIDE] = middle[first[k]][d] - middle[second[k]][d];
     const int more = constrain_KIND(c, 0, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     iterations = (iterations >= 0 && more >= 0 ? iterations + more : -1);
+    UNROLL for (int i = 0; i < (LEAVES_MIDDLE ? NUM_ATOMS : 0); i++)
+        loadVelocity(AGAIN(gamma[0] > 0, velm), atoms[ATOM_BASE + i*NUM_CLUSTERS + c], v[i]);
 #endif
     if (iterations >= 0) {
 #if UPDATE != LANGEVIN
@@ -260,7 +299,7 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed t
             const real charge = loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, x);
 #if UPDATE == LANGEVIN
             UNROLL for (int d = 0; d < 3; d++)
-                x[d] = middle[i][d];
+                x[d] = (LEAVES_MIDDLE ? x[d] : middle[i][d]);
 #endif
             storePosition(posq, posqCorrection, atom, x[0] + dt*v[i][0], x[1] + dt*v[i][1], x[2] + dt*v[i][2], charge);
             velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);

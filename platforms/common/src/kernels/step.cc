@@ -228,10 +228,25 @@ inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
         GLOBAL mixed* RESTRICT multipliers, GLOBAL int* RESTRICT failure
 #define CLUSTER_PARAMETERS int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed* RESTRICT lengths, \
         GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, \
-        GLOBAL mixed* RESTRICT multipliers
+        GLOBAL mixed* RESTRICT multipliers KEPT_PARAMETER
 // The same address, which a compiler does not know, and not before the condition: it loads anew what it would else have to keep.
 #define AGAIN(condition, pointer) ((pointer) + ((condition) && paddedNumAtoms < 0 ? 1 : 0))
-#define CLUSTER_ARGUMENTS paddedNumAtoms, atoms, lengths, posq, posqCorrection, velm, force, multipliers
+#define CLUSTER_ARGUMENTS paddedNumAtoms, atoms, lengths, posq, posqCorrection, velm, force, multipliers KEPT_ARGUMENT
+
+// Local memory for what clusters of many constraints keep: NUM_KEPT numbers for each thread.
+#if NUM_KEPT == 0
+#define KEPT_PARAMETER
+#define KEPT_ARGUMENT
+#define KEPT_MEMORY
+#else
+#define KEPT_PARAMETER , LOCAL_ARG mixed* kept
+#define KEPT_ARGUMENT , kept
+#if IS_FUSED
+#define KEPT_MEMORY LOCAL_ARG mixed* kept = (LOCAL_ARG mixed*) memory;
+#else
+#define KEPT_MEMORY LOCAL mixed kept[NUM_KEPT*GROUP_SIZE];
+#endif
+#endif
 
 LANGEVIN_FUNCTIONS
 
@@ -299,6 +314,7 @@ KERNEL void finishStep(int step, mixed kick, int isFormed, int isStored, GLOBAL 
         GLOBAL mixed* RESTRICT partials, int numPartials, STATE_PARAMETERS FUSED_PARAMETERS LAST_STATE_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     FUSED_MEMORY
+    KEPT_MEMORY
     const mixed dt = (mixed) control[STEP_SIZE];
     MAKE_LAST_STATE(kick, dt, isFormed)
     // After a shortened step the half-step velocities are formed anew, as those of a step of the density that goes on.
@@ -433,6 +449,7 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
         GLOBAL wide* RESTRICT nextTrial, GLOBAL mixed* RESTRICT nextPartials, STATE_PARAMETERS FUSED_PARAMETERS) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     FUSED_MEMORY
+    KEPT_MEMORY
     LOCAL wide shared[2];
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     const bool isFrozen = IS_FROZEN(failure, step);
@@ -496,6 +513,7 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, GLOBAL int* RESTRICT iterationCounts, STATE_PARAMETERS FUSED_PARAMETERS NOISE_STATE) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     FUSED_MEMORY
+    KEPT_MEMORY
     LOCAL wide shared[2];
     mixed sums[NUM_SUMS];
     const bool isFrozen = IS_FROZEN(failure, step);
