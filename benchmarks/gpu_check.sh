@@ -31,7 +31,7 @@ print(libraries, libraries / "plugins", pathlib.Path(openmmvrattle.__file__).par
     export OPENMM_PLUGIN_DIR=$plugins LD_LIBRARY_PATH="$ours:$ours/plugins:$libraries:$plugins:${LD_LIBRARY_PATH:-}"
     end=$((SECONDS + test_seconds))
     for precision in ${PRECISIONS:-double mixed single}; do
-        for name in Agreement Langevin VariableStepRattleIntegrator VariableStepRattleBehaviours LangevinBehaviours Serialization \
+        for name in Agreement Langevin Thermostats VariableStepRattleIntegrator VariableStepRattleBehaviours LangevinBehaviours Serialization \
             MovingParameters Failures ExpressionConstraints Checks; do
             name=Test${name}GPU
             left=$((end - SECONDS < 45 ? end - SECONDS : 45))

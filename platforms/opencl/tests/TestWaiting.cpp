@@ -4,21 +4,18 @@
 // How often the host waits for the device. The functions of OpenCL that can wait are defined here once more, where the loader finds
 // them before those of the driver; they count and go on to those.
 
+#include "../../common/tests/Dumbbells.h"
 #include "../../common/tests/GpuTests.h"
 
-#include "openmm/AndersenThermostat.h"
 #include "openmm/CMMotionRemover.h"
 #include "openmm/Context.h"
-#include "openmm/CustomExternalForce.h"
 #include "openmm/HarmonicBondForce.h"
 #include "openmm/MonteCarloBarostat.h"
 #include "openmm/VariableVerletIntegrator.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
-#include <cmath>
 #include <cstdint>
 #include <dlfcn.h>
-#include <random>
 
 namespace {
 
@@ -82,44 +79,6 @@ using std::vector;
 namespace {
 
 typedef VariableStepRattleIntegrator Integrator_;
-
-// Dumbbells in a field. Nothing of OpenMM waits for the device to compute such forces.
-struct Dumbbells {
-    System system;
-    vector<Vec3> positions, velocities;
-    explicit Dumbbells(int count, const std::string& energy = "100*(x^2+y^2+z^2)+20*cos(9*x)*sin(7*y+5*z)") {
-        auto* field = new CustomExternalForce(energy);
-        std::mt19937 random(5);
-        std::uniform_real_distribution<double> uniform(-1, 1);
-        for (int i = 0; i < 2 * count; i++) {
-            system.addParticle(12);
-            field->addParticle(i);
-            velocities.push_back(Vec3(uniform(random), uniform(random), uniform(random)) * 0.5);
-            const Vec3 place(uniform(random), uniform(random), uniform(random));
-            positions.push_back(i % 2 == 0 ? place : positions.back() + Vec3(0.1, 0, 0));
-            if (i % 2 == 1)
-                system.addConstraint(i - 1, i, 0.1);
-        }
-        system.addForce(field);
-    }
-    void addThermostat(double temperature, double frequency) {
-        auto* thermostat = new AndersenThermostat(temperature, frequency);
-        thermostat->setRandomNumberSeed(3);
-        system.addForce(thermostat);
-    }
-    void begin(Context& context) const {
-        context.setPositions(positions);
-        context.setVelocities(velocities);
-    }
-};
-
-double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
-    double largest = 0;
-    for (size_t i = 0; i < a.size(); i++)
-        for (int j = 0; j < 3; j++)
-            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
-    return largest;
-}
 
 int countWaits(Integrator& integrator, int steps) {
     numWaits = 0;
@@ -199,92 +158,9 @@ void testBarostat() {
     ASSERT_EQUAL(1, countWaits(integrator, 30));
 }
 
-// Collisions come as often as they should, for the time that has passed, and to both particles of a dumbbell; at zero temperature they
-// stop what flies freely.
-void testCollisions() {
-    const int count = 2000;
-    Dumbbells t(count, "0*x");
-    t.addThermostat(0, 0);
-    Integrator_ integrator(0.002);
-    integrator.clearMonitors();
-    integrator.addMonitor(Integrator_::ConstraintMultipliers); // by which steps become longer as particles stop
-    integrator.setMaximumStepSize(0.008);
-    Context context(t.system, integrator, getTestPlatform());
-    t.begin(context);
-    integrator.step(5);
-    const double begin = context.getTime(), frequency = 20;
-    context.setParameter(AndersenThermostat::CollisionFrequency(), frequency);
-    const double first = integrator.getStepSize();
-    integrator.step(15);
-    ASSERT(integrator.getStepSize() > 1.1 * first);
-    // The last step has not had its collisions, and the one before the first has.
-    const double time = context.getTime() - begin - integrator.getStepSize() + first;
-    const vector<Vec3> velocities = context.getState(State::Velocities).getVelocities();
-    int numFlying = 0;
-    for (int i = 0; i < count; i++) {
-        const bool isFlying = velocities[2 * i].dot(velocities[2 * i]) > 1e-20; // which is more than rounding
-        ASSERT_EQUAL(isFlying, velocities[2 * i + 1].dot(velocities[2 * i + 1]) > 1e-20);
-        numFlying += isFlying;
-    }
-    const double expected = std::exp(-frequency * time), scatter = std::sqrt(expected * (1 - expected) / count);
-    ASSERT(std::fabs((double) numFlying / count - expected) < 4 * scatter);
-}
-
-// The temperature of what they leave.
-void testTemperature() {
-    const int count = 2000;
-    Dumbbells t(count, "0*x");
-    t.addThermostat(300, 1000);
-    Integrator_ integrator(0.001);
-    integrator.clearMonitors();
-    Context context(t.system, integrator, getTestPlatform());
-    t.begin(context);
-    integrator.step(30);
-    // Every dumbbell has collided; five degrees of freedom each.
-    const double expected = 0.5 * 5 * count * 0.00831446261815324 * 300;
-    ASSERT(std::fabs(context.getState(State::Energy).getKineticEnergy() / expected - 1) <
-           4 * std::sqrt(2.0 / (5 * count)));
-}
-
-// Velocities that no step can begin with: the failure is found at the end of step(n), and the run is where it was.
-void testFailureOfAChange() {
-    Dumbbells t(20);
-    t.addThermostat(300, 0);
-    Integrator_ integrator(0.001);
-    Context context(t.system, integrator, getTestPlatform());
-    t.begin(context);
-    for (const int before : {7, 5}) {
-        integrator.step(before);
-        const State state = context.getState(State::Positions | State::Velocities);
-        context.setParameter(AndersenThermostat::Temperature(), 1e90);
-        context.setParameter(AndersenThermostat::CollisionFrequency(), 1e9);
-        std::string message;
-        try {
-            integrator.step(10);
-        }
-        catch (const OpenMMException& failure) {
-            message = failure.what();
-        }
-        ASSERT(message.find("VariableStepRattleIntegrator: the step at t = ") == 0);
-        ASSERT_EQUAL(state.getStepCount(), context.getStepCount());
-        ASSERT_EQUAL_TOL(state.getTime(), context.getTime(), 1e-12);
-        ASSERT(largestDifference(state.getPositions(), context.getState(State::Positions).getPositions()) <= 1e-12);
-        context.setParameter(AndersenThermostat::Temperature(), 300);
-        context.setParameter(AndersenThermostat::CollisionFrequency(), 0);
-        context.setVelocities(state.getVelocities());
-    }
-    integrator.step(3);
-    ASSERT_EQUAL(15, context.getStepCount());
-}
-
 } // namespace
 
 int main(int argc, char** argv) {
-    return runOnPlatform({{"thermostats", testThermostats},
-                          {"OpenMM's own", testOpenMM},
-                          {"barostat", testBarostat},
-                          {"collisions", testCollisions},
-                          {"temperature", testTemperature},
-                          {"failure of a change", testFailureOfAChange}},
+    return runOnPlatform({{"thermostats", testThermostats}, {"OpenMM's own", testOpenMM}, {"barostat", testBarostat}},
                          argc, argv);
 }
