@@ -3,7 +3,7 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, 4 for Langevin dynamics), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "large" (a long and a short chain too, the long one in pieces that wait for each other), "dense" (many bonds on one particle),
+// on heavy atoms, rigid water), "large" (a long chain too, and but for Langevin dynamics a short one, the long one in pieces that wait for each other), "dense" (many bonds on one particle),
 // "expressions" (angles, and all functions), or "rare" with the number of a graph of up to eight constraints, for that alone.
 
 #include "StepProgram.h"
@@ -62,10 +62,10 @@ int main(int argc, char** argv) {
         bonds.emplace_back(graphs == "large" ? i : 0, i + 1);
     if (graphs == "large" || graphs == "dense")
         add(bonds);
-    if (graphs == "large")
-        add(rare[5]); // whose vectors share the memory of pieces
     const int updateNumber = std::stoi(argv[3]);
     const bool isAutomatic = updateNumber == 3, isLangevin = updateNumber == 4;
+    if (graphs == "large" && !isLangevin)
+        add(rare[5]); // whose vectors share the memory of pieces
     vector<StepMonitor::Term> terms;
     if (!isAutomatic)
         terms.push_back({(StepMonitor::Kind) std::stoi(argv[2]), 1, 1, 1});
