@@ -5,6 +5,7 @@
 // numbers depend on the seed and the step alone, so what is a sample here is the same one on all platforms. Each platform's tests/
 // includes this file.
 
+#include "BehaviourSystems.h"
 #include "TestSupport.h"
 #include "openmm/Context.h"
 #include "openmm/CustomExternalForce.h"
@@ -24,17 +25,8 @@ using std::vector;
 
 typedef VariableStepRattleLangevinIntegrator Langevin;
 
-const double BOLTZMANN = 8.31446261815324e-3;
-
 /** The platform under test; set by the platform's own file. */
 Platform& getTestPlatform();
-
-// A number in [-0.5, 0.5) for each coordinate.
-inline Vec3 randomVec(std::mt19937& random) {
-    std::uniform_real_distribution<double> uniform(-0.5, 0.5);
-    const double x = uniform(random), y = uniform(random);
-    return Vec3(x, y, uniform(random));
-}
 
 // Two particles on a spring at a temperature of zero, from rest: known in closed form. Without friction the energy stays.
 inline void testSingleBond() {
@@ -205,20 +197,12 @@ inline void testRandomSeed() {
 inline void testInitialTemperature() {
     const int numParticles = 50000;
     System system;
-    std::mt19937 random(5);
-    vector<Vec3> positions;
-    for (int i = 0; i < numParticles; i++) {
-        system.addParticle(1.0);
-        positions.push_back(randomVec(random));
-    }
+    const vector<Vec3> positions = addFreeParticles(system, numParticles);
     Langevin integrator(300, 25, 0.001);
     Context context(system, integrator, getTestPlatform());
     context.setPositions(positions);
     context.setVelocitiesToTemperature(300, 5);
-    double kinetic = 0;
-    const vector<Vec3> velocities = context.getState(State::Velocities).getVelocities();
-    for (const Vec3& v : velocities)
-        kinetic += 0.5 * v.dot(v);
+    const double kinetic = kineticEnergyOf(context);
     ASSERT_EQUAL_TOL(300, 2 * kinetic / (3 * numParticles * BOLTZMANN), 5 * std::sqrt(2.0 / (3 * numParticles)));
     // Without a force the velocities half a step before are the same.
     ASSERT_EQUAL_TOL(kinetic, context.getState(State::Energy).getKineticEnergy(), 1e-6);
@@ -227,14 +211,7 @@ inline void testInitialTemperature() {
 // The forces of the integrator's groups alone act, and those of others where they are asked for.
 inline void testForceGroups() {
     System system;
-    system.addParticle(1.0);
-    const char* const expressions[2] = {"x", "y"};
-    for (int i = 0; i < 2; i++) {
-        CustomExternalForce* force = new CustomExternalForce(expressions[i]);
-        force->addParticle(0);
-        force->setForceGroup(i + 1);
-        system.addForce(force);
-    }
+    addPulledParticle(system);
     const double friction = 1, h = 0.01, damping = std::exp(-friction * h);
     Langevin integrator(0, friction, h);
     integrator.setIntegrationForceGroups(1 << 1);

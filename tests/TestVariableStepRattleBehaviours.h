@@ -5,6 +5,7 @@
 // VariableStepRattleIntegrator. OpenMM allows the energy an error of 1e-2 (5e-2 for the single bond with variable steps);
 // here it is 1e-4, a hundredth of that, or less, unless a test says why not. Each platform's tests/ includes this file.
 
+#include "BehaviourSystems.h"
 #include "TestSupport.h"
 #include "openmm/AndersenThermostat.h"
 #include "openmm/Context.h"
@@ -27,8 +28,6 @@ using namespace OpenMM;
 using std::vector;
 
 typedef VariableStepRattleIntegrator Integrator_;
-
-const double BOLTZMANN = 8.31446261815324e-3;
 
 /** The platform under test; set by the platform's own file. */
 Platform& getTestPlatform();
@@ -83,13 +82,6 @@ inline double runAndCheck(Context& context, VariableStepRattleIntegrator& integr
         integrator.step(1);
     }
     return worst;
-}
-
-// A number in [-0.5, 0.5) for each coordinate, as OpenMM's tests choose velocities.
-inline Vec3 randomVec(std::mt19937& random) {
-    std::uniform_real_distribution<double> uniform(-0.5, 0.5);
-    const double x = uniform(random), y = uniform(random);
-    return Vec3(x, y, uniform(random));
 }
 
 // Two particles on a spring: known in closed form.
@@ -334,21 +326,13 @@ inline void testInitialTemperature() {
     const int numParticles = 50000;
     const double temperature = 300.0;
     System system;
-    std::mt19937 random(5);
-    vector<Vec3> positions;
-    for (int i = 0; i < numParticles; i++) {
-        system.addParticle(1.0);
-        positions.push_back(randomVec(random));
-    }
+    const vector<Vec3> positions = addFreeParticles(system, numParticles);
     VariableStepRattleIntegrator integrator(0.001);
     integrator.clearMonitors();
     Context context(system, integrator, getTestPlatform());
     context.setPositions(positions);
     context.setVelocitiesToTemperature(temperature, 5);
-    double kinetic = 0;
-    const vector<Vec3> velocities = context.getState(State::Velocities).getVelocities();
-    for (const Vec3& v : velocities)
-        kinetic += 0.5 * v.dot(v);
+    const double kinetic = kineticEnergyOf(context);
     // 150,000 freedoms: standard error of 0.4 %, as in OpenMM's test.
     ASSERT_USUALLY_EQUAL_TOL(temperature, 2 * kinetic / (3 * numParticles * BOLTZMANN), 0.01);
     ASSERT_EQUAL_TOL(kinetic, context.getState(State::Energy).getKineticEnergy(), 1e-6);
@@ -359,14 +343,7 @@ inline void testInitialTemperature() {
 
 inline void testForceGroups() {
     System system;
-    system.addParticle(1.0);
-    const char* const expressions[2] = {"x", "y"};
-    for (int i = 0; i < 2; i++) {
-        CustomExternalForce* force = new CustomExternalForce(expressions[i]);
-        force->addParticle(0);
-        force->setForceGroup(i + 1);
-        system.addForce(force);
-    }
+    addPulledParticle(system);
     VariableStepRattleIntegrator integrator(0.01);
     integrator.clearMonitors();
     integrator.setIntegrationForceGroups(1 << 1);
