@@ -31,7 +31,7 @@ import openmm
 import pages
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleLangevinIntegrator
-from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters, water_clash
+from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters
 
 KT = 0.00831446261815324
 INTEGRATORS = {
@@ -88,30 +88,35 @@ class Outcome:
     seconds: float
 
 
+relaxed_waters = functools.cache(rigid_waters)
+
+
 def waters_pushed_together(factor: float) -> Callable[[int], Start]:
-    """Eight waters, of which the two that water_clash has at half a diameter are brought to another fraction."""
+    """Eight waters, of which two are brought to a fraction of their diameter: others in each start."""
 
     def make(start: int) -> Start:
-        clash = water_clash()
-        positions = np.array(clash.positions)
-        oxygens = np.arange(0, len(positions), 3)
-        distances = np.linalg.norm(positions[oxygens][:, None] - positions[oxygens][None], axis=2)
-        distances[np.diag_indices(len(oxygens))] = np.inf
-        i, j = np.unravel_index(np.argmin(distances), distances.shape)
-        direction = positions[3 * j] - positions[3 * i]
-        direction /= np.linalg.norm(direction)
-        positions[3 * j : 3 * j + 3] += (factor * 0.315061 - distances[i, j]) * direction
-        return clash.system, positions, np.array(clash.velocities)
+        waters = relaxed_waters(8)
+        positions = np.array(waters.positions)
+        oxygens = positions[::3]
+        pairs = [(i, j) for i in range(len(oxygens)) for j in range(i)]
+        i, j = sorted(pairs, key=lambda pair: np.linalg.norm(oxygens[pair[0]] - oxygens[pair[1]]))[start - 1]
+        direction = oxygens[j] - oxygens[i]
+        distance = np.linalg.norm(direction)
+        positions[3 * j : 3 * j + 3] += (factor * 0.315061 / distance - 1) * direction
+        return waters.system, positions, np.array(waters.velocities)
 
     return make
 
 
 @functools.cache
-def solvated_peptide(start: int = 0) -> Start:
-    """Alanine dipeptide in water as it comes from Modeller, at rest; the starts differ by the noise alone."""
+def solvated_peptide(start: int) -> Start:
+    """Alanine dipeptide, turned at random, in water as Modeller then places it, at rest."""
     peptide = alanine_dipeptide()
+    turn, upper = np.linalg.qr(np.random.default_rng(start).normal(size=(3, 3)))
+    turn *= np.sign(np.diag(upper))
+    turn[:, 0] *= np.linalg.det(turn)  # no mirror image
     force_field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
-    modeller = app.Modeller(peptide.topology, peptide.positions * unit.nanometer)
+    modeller = app.Modeller(peptide.topology, np.array(peptide.positions) @ turn * unit.nanometer)
     modeller.addSolvent(force_field, padding=0.8 * unit.nanometer)
     system = force_field.createSystem(
         modeller.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.8 * unit.nanometer, constraints=app.HBonds
@@ -271,9 +276,6 @@ def stretched_water(start: int) -> Start:
     return system, positions.reshape(-1, 3), None
 
 
-relaxed_waters = functools.cache(rigid_waters)
-
-
 def waters_at_random_places(start: int) -> Start:
     """27 rigid waters in a cube of 1 nm, turned at random, oxygens no nearer than 0.1 nm."""
     random = np.random.default_rng(start)
@@ -354,7 +356,7 @@ def ROWS() -> dict[str, Row]:
             name = f"two of eight rigid waters at {factor} of their diameter, {1000 * step:g} fs"
             rows[name] = Row(waters_pushed_together(factor), step, 10.0)
     for step in (0.002, 0.004):
-        name = f"alanine dipeptide in water from Modeller, not minimised, at rest, {1000 * step:g} fs"
+        name = f"alanine dipeptide, turned, in water from Modeller, not minimised, at rest, {1000 * step:g} fs"
         rows[name] = Row(solvated_peptide, step, 2.0, platform="CPU")
     for step in (0.004, 0.005):
         name = f"alanine dipeptide in vacuum, HBonds, no mass repartitioning, {1000 * step:g} fs"
