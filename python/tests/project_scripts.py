@@ -7,6 +7,7 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -26,3 +27,19 @@ def load_script(path: str) -> ModuleType:
     sys.modules[specification.name] = module  # where dataclasses look up the module of a class
     specification.loader.exec_module(module)
     return module
+
+
+def run_quickly(example: ModuleType, folder: Path) -> Any:
+    """The study of a quick run of a whole example, which writes its files into a folder."""
+    studies = []
+
+    def run_and_keep(*arguments: Any) -> Any:
+        studies.append(run_study(*arguments))
+        return studies[-1]
+
+    run_study, example.run_study = example.run_study, run_and_keep
+    try:
+        assert example.main(["--quick", "--output", str(folder)]) == 0
+    finally:
+        example.run_study = run_study
+    return studies[0]

@@ -37,6 +37,17 @@ def with_update(integrator: VariableStepRattleIntegrator, update: str) -> Variab
     return integrator
 
 
+def add_thermostat_and_trap(system: openmm.System, frequency: float) -> None:
+    """For waters(): 300 K, and a soft trap, out of which two walls of vapour cannot fly."""
+    thermostat = openmm.AndersenThermostat(300, frequency)
+    thermostat.setRandomNumberSeed(8)
+    system.addForce(thermostat)
+    trap = openmm.CustomExternalForce("50*((x-0.15)^2+(y-0.15)^2+(z-0.15)^2)")
+    for i in range(0, 24, 3):
+        trap.addParticle(i, [])
+    system.addForce(trap)
+
+
 def fastest_platform() -> str:
     """CPU where there is one: for tests too slow on Reference."""
     names = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}

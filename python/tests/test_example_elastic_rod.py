@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dense_rod import Rod
-from project_scripts import load_script
+from project_scripts import load_script, run_quickly
 
 
 @pytest.fixture(scope="module")
@@ -27,18 +27,7 @@ def example() -> ModuleType:
 def finished(example: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     """The study of a quick run of the whole script, and the folder with its files."""
     folder = tmp_path_factory.mktemp("elastic_rod") / "not" / "there"
-    studies = []
-
-    def run_and_keep(*arguments: Any) -> Any:
-        studies.append(run_study(*arguments))
-        return studies[-1]
-
-    run_study, example.run_study = example.run_study, run_and_keep
-    try:
-        assert example.main(["--quick", "--output", str(folder)]) == 0
-    finally:
-        example.run_study = run_study
-    return studies[0], folder
+    return run_quickly(example, folder), folder
 
 
 @pytest.fixture

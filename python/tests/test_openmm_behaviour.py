@@ -22,7 +22,13 @@ from dense_reference import (
 )
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
-from run_support import BOLTZMANN, fastest_platform, make_integrator, rattle_as_custom_integrator
+from run_support import (
+    BOLTZMANN,
+    add_thermostat_and_trap,
+    fastest_platform,
+    make_integrator,
+    rattle_as_custom_integrator,
+)
 
 
 @pytest.fixture(scope="module")
@@ -232,14 +238,7 @@ def test_andersen_thermostat(update: str, platform: str) -> None:
     """From rest to 300 K: the velocities that the thermostat sets are those that the integrator goes on with."""
     model = waters()
     system = model.system()
-    thermostat = openmm.AndersenThermostat(300, 20)
-    thermostat.setRandomNumberSeed(8)
-    system.addForce(thermostat)
-    # Two walls of water vapour cannot fly apart: a soft trap.
-    trap = openmm.CustomExternalForce("50*((x-0.15)^2+(y-0.15)^2+(z-0.15)^2)")
-    for i in range(0, 24, 3):
-        trap.addParticle(i, [])
-    system.addForce(trap)
+    add_thermostat_and_trap(system, 20)
     integrator = make_integrator(0.001, "ConstraintAndAppliedForce")
     integrator.setUpdateMethod(getattr(VariableStepRattleIntegrator, update))
     context = open_context(system, integrator, platform, model)

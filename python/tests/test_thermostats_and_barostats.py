@@ -12,6 +12,7 @@ from openmmvrattle.testsystems import constraint_error
 from run_support import (
     BOLTZMANN,
     FORCE_MONITOR,
+    add_thermostat_and_trap,
     degrees_of_freedom,
     fastest_platform,
     make_integrator,
@@ -68,13 +69,7 @@ def test_temperature_holds(update: str) -> None:
     """Over 100 ps the time average of the temperature is the thermostat's to two parts in a hundred."""
     model = waters()
     system = model.system()
-    thermostat = openmm.AndersenThermostat(300, 10)
-    thermostat.setRandomNumberSeed(8)
-    system.addForce(thermostat)
-    trap = openmm.CustomExternalForce("50*((x-0.15)^2+(y-0.15)^2+(z-0.15)^2)")
-    for i in range(0, 24, 3):
-        trap.addParticle(i, [])
-    system.addForce(trap)
+    add_thermostat_and_trap(system, 10)
     integrator = with_update(make_integrator(0.001, FORCE_MONITOR), update)
     context = open_context(system, integrator, "Reference", model)
     integrator.step(5000)

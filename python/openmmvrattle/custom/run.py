@@ -191,8 +191,10 @@ def _clusters(pairs: list[tuple[int, int]]) -> list[list[int]]:
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     """The Context that an integrator is bound to.
 
-    In Python OpenMM tells an integrator nothing of its Context, and nothing of ours is called when one is made. So look
-    for the one that refers to the integrator, once for each; attachContext() does without.
+    In Python OpenMM tells an integrator nothing of its Context, nothing of ours is called when one is made, no method
+    of an integrator leads to it, and its program can hold numbers alone; while its platform, its time and its
+    constraints are needed from the first step on. So look for the one that refers to the integrator, once for each;
+    attachContext() does without.
     """
     for referrer in gc.get_referrers(integrator):
         owners = [referrer] if not isinstance(referrer, dict) else gc.get_referrers(referrer)
