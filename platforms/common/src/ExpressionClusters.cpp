@@ -3,6 +3,7 @@
 
 #include "ExpressionClusters.h"
 #include "ExpressionCode.h"
+#include "ExpressionTexts.h"
 #include "constraints/EliminationOrder.h"
 #include <algorithm>
 #include <map>
@@ -53,6 +54,9 @@ enum Header {
 };
 
 const int DISTANCE = 0;
+// What has more is not compiled anew in each of the five or so places from which it is called, and keeps its registers to itself.
+const size_t MANY_OPERATIONS = 2000;
+const char INLINE[] = "inline ";
 const char DISTANCE_EXPRESSION[] = "0.5*((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2 - length^2)";
 
 int findRoot(vector<int>& parents, int i) {
@@ -68,10 +72,11 @@ struct ExpressionClusters::Row {
     vector<int> particles;
 };
 
-ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vector<ExpressionConstraint>& expressions) :
+ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vector<ExpressionConstraint>& given) :
         isMember(system.getNumParticles(), false), numConstraints(0), numLevels(0), numWork(0), numFactorEntries(0) {
-    if (expressions.empty())
+    if (given.empty())
         return;
+    const vector<ExpressionConstraint> expressions = shareTexts(given);
     kindOf({DISTANCE_EXPRESSION, {0, 1}, {{"length", 1.0}}});
     const int numParticles = system.getNumParticles();
     vector<double> masses(numParticles);
@@ -143,7 +148,7 @@ ExpressionClusters::Kind ExpressionClusters::nameKind(const ExpressionConstraint
 size_t ExpressionClusters::findSize(const vector<ExpressionConstraint>& expressions) {
     std::set<Kind> known;
     size_t size = 0;
-    for (const ExpressionConstraint& constraint : expressions)
+    for (const ExpressionConstraint& constraint : shareTexts(expressions))
         if (known.insert(nameKind(constraint)).second)
             size += ExpressionCode(ExpressionDerivatives(constraint)).getSize();
     return size;
@@ -326,8 +331,12 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
 
 string ExpressionClusters::writeFunctions() const {
     string text;
-    for (size_t i = 0; i < kinds.size(); i++)
-        text += ExpressionCode(*kinds[i]).write("_E" + std::to_string(i));
+    size_t size = 0;
+    for (size_t i = 0; i < kinds.size(); i++) {
+        const ExpressionCode code(*kinds[i]);
+        text += code.write("_E" + std::to_string(i));
+        size += code.getSize();
+    }
     auto choose = [&](const string& type, const string& name, const string& function, const string& parameterList,
                       const string& arguments) {
         text += "inline DEVICE " + type + " " + name + "(int kind, " + parameterList + ") {\n";
@@ -347,5 +356,8 @@ string ExpressionClusters::writeFunctions() const {
     choose("mixed", "findCurvature", "curvature", x + v + theta, "x, v, at, theta");
     choose("mixed", "findMovingCurvature", "movingCurvature", x + v + theta + rates, "x, v, at, theta, rates, factor");
     choose("void", "findGradient", "gradient", x + theta + ", GLOBAL mixed* G", "x, at, theta, G");
+    if (size > MANY_OPERATIONS)
+        for (size_t at = text.find(INLINE); at != string::npos; at = text.find(INLINE, at))
+            text.replace(at, string(INLINE).size(), "__attribute__((noinline)) ");
     return text;
 }

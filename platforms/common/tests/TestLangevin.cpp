@@ -384,6 +384,13 @@ void testExpressions() {
     ASSERT(integrators[0].getNumSubstepped() < before + 20);
     for (auto& integrator : integrators)
         integrator.setReferenceMonitorValue(3 * u);
+    // A bond that is pulled, and let go on the device.
+    for (const double pulled : {1.01 * length, length}) {
+        for (auto& integrator : integrators)
+            integrator.setExpressionParameterValue(3, "r", pulled);
+        requireAgreement(5, choose(1e-8, 1e-3, 1e-1), choose(1e-5, 1e-2, 1e-1));
+        ASSERT(integrators[1].isOnDevice());
+    }
 
     const int numBlocks = 20, numSamples = 15;
     const double degrees[] = {3.0 * numDumbbells, 2.0 * numDumbbells, (2.0 * chainSize + 1) * numChains};

@@ -130,8 +130,8 @@ def main(print_kernels: str) -> int:
             )
             assert {"finishStep", "advanceStep"} <= {kernel[0] for kernel in kernels}, report
             for name, stack, spills, registers in kernels:
-                # Those with expressions have their numbers in global memory.
-                failed = not name.endswith("Expressions") and (int(stack) > 0 or int(spills) > 0)
+                # The sines of expressions have arrays of their own.
+                failed = int(spills) > 0 or (int(stack) > 0 and not name.endswith("Expressions"))
                 num_failed += failed
                 print(
                     f"{'FAILED' if failed else 'passed'}: {precision} update {update} {graphs} {architecture} {name}: "

@@ -5,6 +5,7 @@
 
 #include "DeviceSteps.h"
 #include "ExpressionCode.h"
+#include "ExpressionTexts.h"
 #include "TestSupport.h"
 #include "expressions/ExpressionGroup.h"
 #include "openmm/Context.h"
@@ -18,6 +19,7 @@
 #include <cmath>
 #include <memory>
 #include <random>
+#include <set>
 
 using namespace OpenMMVRattle;
 using OpenMM::Context;
@@ -445,6 +447,7 @@ Molecules makeExpressions() {
     molecules.addExpression(DISTANCE, {pendulum, fixed});
     molecules.addExpression(DISTANCE, {fixed, pendulum + 1});
     molecules.addExpression("x1^2+0.3*y1*z1", {pendulum + 2});
+    molecules.addExpression("x1^2+0.7*y1*z1", {addFree(1)});
     molecules.addExpression("select(step(x1-5), log(-1-x1^2), tanh(x1+2*z1)*erf(y1)^3)", {pendulum + 2});
     const int angle = addFree(3);
     molecules.addExpression(ANGLE, {angle, angle + 1, angle + 2});
@@ -550,7 +553,7 @@ void testDivisionOfExpressions() {
     const double perStep = (double) (both.device.getNumIterations() - iterations) / 10;
     ASSERT(perStep >= 1 && perStep <= 8);
     const ExpressionClusters& clusters = both.device.getExpressionClusters();
-    ASSERT_EQUAL(1, clusters.getParts().size()); // of 88 constraints
+    ASSERT_EQUAL(1, clusters.getParts().size()); // of 89 constraints
     // A ladder: sections of two particles that a distance joins, each joined to the next by two expressions. As a chain it halves in
     // each round, of up to three constraints that are coupled.
     System ladder;
@@ -943,6 +946,66 @@ void testExpressionCode() {
                                           std::to_string(expected[i]));
 }
 
+// Texts that differ in numbers alone become one, of the same values and derivatives; others stay as they are.
+void testSharedTexts() {
+    struct Case {
+        vector<std::string> texts;
+        size_t numTexts;
+    };
+    const vector<Case> cases = {{{"x1*1.5-k/.25e-1*y2", "x1*2-k/3*y2", "x1*1.5-k/3*y2"}, 1},
+                                {{"0*log(-1.5-x1^2)+z1", "1*log(-1.5-x1^2)+z1"}, 2}, // zeros simplify
+                                {{"x1^2.5+y2", "x1^3.5+y2", "(x1-1)^3.5+y2", "(x1-2)^3.5+y2"}, 3},
+                                {{"x1^n*3; n=2", "x1^n*4; n=3"}, 2},
+                                {{"x1^(-3)+0.1*y2^-2", "x1^( -3 )+0.2*y2^-2", "x1^(-3)+0.3*y2^-2"}, 2},
+                                {{"a2*2.5e+1+atan2(a2, 0.5); a2=x1*1.25", "a2*7+atan2(a2, 9); a2=x1*8."}, 1},
+                                {{"select(step(x1-0.5), x1*2, y2*3)", "select(step(x1-0.75), x1*4, y2*3)"}, 1},
+                                {{"k*x1-1", "k*x1-1"}, 1}};
+    const vector<Vec3> q = {Vec3(0.7, 0.3, -0.4), Vec3(0.5, 0.9, 1.3)},
+                       v = {Vec3(0.2, -0.6, 1.1), Vec3(-0.8, 0.5, 0.3)};
+    const auto evaluate = [&](const ExpressionConstraint& constraint) {
+        ExpressionGroup group(constraint);
+        group.add(constraint, 0, 0, 0, {1, 1});
+        group.compile();
+        ExpressionParameters theta;
+        for (const auto& parameter : constraint.parameters) {
+            theta.values.push_back(parameter.second);
+            theta.rates.push_back(0);
+        }
+        vector<double> numbers(2);
+        vector<Vec3> gradient(2);
+        vector<double> curvature(1);
+        group.evaluate(q, theta, numbers, 0, 1);
+        group.evaluateCurvature(q, v, theta, curvature, 0, 1);
+        group.evaluateJacobian(q, theta, gradient, 0, 1);
+        numbers[1] = curvature[0];
+        for (const Vec3& each : gradient)
+            numbers.insert(numbers.end(), {each[0], each[1], each[2]});
+        return numbers;
+    };
+    for (const Case& each : cases) {
+        vector<ExpressionConstraint> given;
+        for (const std::string& text : each.texts)
+            given.push_back({text, {0, 1}, {{"k", 0.8}}});
+        const vector<ExpressionConstraint> shared = shareTexts(given);
+        std::set<std::string> texts;
+        for (size_t i = 0; i < given.size(); i++) {
+            texts.insert(shared[i].expression);
+            ASSERT_EQUAL(0.8, shared[i].parameters.begin()->second); // before all others
+            const vector<double> expected = evaluate(given[i]), found = evaluate(shared[i]);
+            for (size_t k = 0; k < expected.size(); k++)
+                if (!std::isnan(expected[k]) || !std::isnan(found[k]))
+                    ASSERT(std::fabs(found[k] - expected[k]) <= 1e-14 * (1 + std::fabs(expected[k])));
+        }
+        ASSERT_EQUAL(each.numTexts, texts.size());
+    }
+    ASSERT_EQUAL("k*x1-1", shareTexts({{"k*x1-1", {0}, {{"k", 1.0}}}})[0].expression);
+    // Angles that are written into their texts.
+    vector<ExpressionConstraint> angles;
+    for (int i = 0; i < 200; i++)
+        angles.push_back({std::to_string(1 + 0.001 * i) + "-" + ANGLE, {i, i + 1, i + 2}, {}});
+    ASSERT(DeviceSteps::canTake(angles));
+}
+
 // LangevinDynamics and DeviceSteps side by side, with forces from one Context.
 struct BothLangevin {
     Lender lender;
@@ -1147,6 +1210,7 @@ int main(int argc, char** argv) {
         {"a failure with automatic step control and an expression, double",
          [] { testFailureOfAutomaticControl("double", true); }},
         {"expressions are written as they are evaluated", testExpressionCode},
+        {"texts that differ in numbers", testSharedTexts},
         {"Langevin, double", [] { testLangevinAgrees(Molecules(2), "double", 1e-12, 1e-9); }},
         {"Langevin, mixed", [] { testLangevinAgrees(Molecules(2), "mixed", 1e-9, 1e-6); }},
         {"Langevin, single", [] { testLangevinAgrees(Molecules(2), "single", 1e-6, 1e-4); }},
