@@ -50,15 +50,17 @@ cxx-test: $(TOOLS)
 	$(BIN)/cmake --build $(BUILD) --parallel $(JOBS)
 	$(BIN)/ctest --test-dir $(BUILD) --parallel $(JOBS) --output-on-failure --no-tests=error --output-junit "$(CXX_REPORT)"
 
-# The C++ tests with AddressSanitizer (with its search for leaks) and UndefinedBehaviorSanitizer, GCC or Clang; about three
-# minutes. OpenMM's own libraries are not instrumented: only memory that our code reads, writes or forgets is watched.
-# Leak reports need frame pointers to tell whose memory it was.
+# The C++ tests with AddressSanitizer (with its search for leaks) and UndefinedBehaviorSanitizer, GCC or Clang. OpenMM's own
+# libraries are not instrumented: only memory that our code reads, writes or forgets is watched. Leak reports need frame
+# pointers to tell whose memory it was. What compiles kernels for CUDA is a script in Python.
 sanitize: $(TOOLS)
 	$(call configure,$(SANITIZE_BUILD),-DCMAKE_BUILD_TYPE=RelWithDebInfo \
 		-DCMAKE_CXX_FLAGS="-O1 -fsanitize=address$(comma)undefined -fno-sanitize-recover=all -fno-omit-frame-pointer")
 	$(BIN)/cmake --build $(SANITIZE_BUILD) --parallel $(JOBS)
 	ASAN_OPTIONS=detect_leaks=1:strict_string_checks=1:detect_stack_use_after_return=1 UBSAN_OPTIONS=print_stacktrace=1 \
-		$(BIN)/ctest --test-dir $(SANITIZE_BUILD) --output-on-failure --no-tests=error
+		LSAN_OPTIONS=suppressions=$(abspath tests/leaks_of_others.txt):print_suppressions=0 \
+		$(BIN)/ctest --test-dir $(SANITIZE_BUILD) --parallel $(JOBS) --exclude-regex CompileKernels \
+		--output-on-failure --no-tests=error
 
 # The C++ tests that share work among threads, with ThreadSanitizer; about three minutes.
 sanitize-threads: $(TOOLS)
