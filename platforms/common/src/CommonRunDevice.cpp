@@ -54,7 +54,8 @@ CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::Com
     // change places on the device, and the host takes the steps.
     const bool areKnown = settings.expressions.empty() || !compute.getEnergyBuffer().isInitialized();
     if (!settings.expressions.empty() && areKnown) {
-        expressionInfo = new ExpressionInfo(settings.expressions);
+        knownExpressions = settings.expressions;
+        expressionInfo = new ExpressionInfo(knownExpressions);
         compute.addForce(expressionInfo); // to which it belongs from now on
     }
     compute.initializeContexts();

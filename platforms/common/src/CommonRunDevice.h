@@ -112,7 +112,8 @@ private:
     OpenMM::ContextImpl& context;
     OpenMM::ComputeContext& compute;
     ForceActions actions;
-    ExpressionInfo* expressionInfo;     // of the Context, or null
+    std::vector<ExpressionConstraint> knownExpressions; // to the Context, by the next
+    ExpressionInfo* expressionInfo;                     // of the Context, or null
     std::unique_ptr<DeviceSteps> steps; // none where the host takes them all
     DeviceSteps::State state; // of the device when it was read last
     DeviceSteps::Report lastReport;

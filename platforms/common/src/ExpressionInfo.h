@@ -12,11 +12,13 @@ namespace OpenMMVRattle {
 
 /**
  * Tells OpenMM of constraints that are given as expressions, which it knows nothing of and which make molecules differ: only identical ones
- * may change places on a device. To be added to the Context's ComputeContext before that is initialized.
+ * may change places on a device. To be added to the Context's ComputeContext before that is initialized. Owns nothing: OpenMM 8.6 deletes
+ * it as a ComputeForceInfo, whose destructor is not virtual.
  */
 class ExpressionInfo : public OpenMM::ComputeForceInfo {
 public:
-    explicit ExpressionInfo(const std::vector<ExpressionConstraint>& expressions) : expressions(expressions) {
+    /** @param expressions what it tells of; they must exist as long as the Context asks, and their parameters are changed */
+    explicit ExpressionInfo(std::vector<ExpressionConstraint>& expressions) : expressions(expressions) {
     }
     /** Take note of other values of the parameters; ComputeContext::invalidateMolecules() is to be called then. */
     void setParameters(const std::vector<ExpressionConstraint>& others) {
@@ -38,7 +40,7 @@ public:
     }
 
 private:
-    std::vector<ExpressionConstraint> expressions;
+    std::vector<ExpressionConstraint>& expressions;
 };
 
 } // namespace OpenMMVRattle
