@@ -3,8 +3,9 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, 4 for Langevin dynamics), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "large" (a long chain too, and but for Langevin dynamics a short one, the long one in pieces that wait for each other), "dense" (many bonds on one particle),
-// "expressions" (angles, and all functions), or "rare" with the number of a graph of up to eight constraints, for that alone.
+// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other, and but for Langevin dynamics a short
+// one), "dense" (many bonds on one particle), "expressions" (angles, and all functions), or "rare" with the number of a graph of up to
+// eight constraints, for that alone.
 
 #include "StepProgram.h"
 #include "TestSupport.h"
