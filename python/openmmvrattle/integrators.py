@@ -37,7 +37,7 @@ def _cast(integrator: openmm.Integrator, wanted: type, compiled: Any) -> Any:
     """Return the same Python object as a `wanted`, whose compiled class is `compiled`."""
     if isinstance(integrator, wanted):
         return integrator
-    typed = compiled._cast(integrator)
+    typed = compiled._cast(integrator) if isinstance(integrator, openmm.Integrator) else None
     if typed is None:
         raise TypeError(f"a {type(integrator).__name__} is not a {wanted.__name__}")
     typed.thisown = integrator.thisown
@@ -1137,7 +1137,9 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         bool
             whether cast() would take it
         """
-        return vrattle.VariableStepRattleIntegrator._isinstance(integrator)
+        return isinstance(integrator, openmm.Integrator) and vrattle.VariableStepRattleIntegrator._isinstance(
+            integrator
+        )
 
     @staticmethod
     def cast(integrator: openmm.Integrator) -> VariableStepRattleIntegrator:
@@ -1464,7 +1466,9 @@ class VariableStepRattleLangevinIntegrator(ConstrainedIntegrator, vrattle.Variab
         bool
             whether cast() would take it
         """
-        return vrattle.VariableStepRattleLangevinIntegrator._isinstance(integrator)
+        return isinstance(integrator, openmm.Integrator) and vrattle.VariableStepRattleLangevinIntegrator._isinstance(
+            integrator
+        )
 
     @staticmethod
     def cast(integrator: openmm.Integrator) -> VariableStepRattleLangevinIntegrator:
