@@ -109,6 +109,7 @@ void IntegratorRun::takeSettings() {
                               ": constraints have been added or replaced since the Context "
                               "was created; call reinitialize(preserveState=True) of the Context to use them");
     try {
+        takeForcesOfOthers();
         device.setSettings(settings);
     }
     catch (const StepFailure& failure) {
@@ -125,6 +126,15 @@ void IntegratorRun::takeSettings() {
         task = Task::Start;
     applied = settings;
     areSettingsChanged = false;
+}
+
+// A device that has no forces but those that were computed last may have those of new parameters already: before anything else is
+// made of them, the density takes note.
+void IntegratorRun::takeForcesOfOthers() {
+    if (task != Task::None || !areForcesChanged || !device.usesForcesOfOthers())
+        return;
+    device.changeForces();
+    areForcesChanged = false;
 }
 
 // Go on from a saved run, unless the Context is in another state.
@@ -387,7 +397,13 @@ RunState IntegratorRun::save() {
     if (canTakeSettings()) {
         takeSaved();
         takeSettings();
-        run.startsAfresh = task != Task::None;
+        try {
+            takeForcesOfOthers();
+            run.startsAfresh = task != Task::None;
+        }
+        catch (const StepFailure&) {
+            run.startsAfresh = true;
+        }
     }
     run.context = device.getFingerprint();
     run.parameters = device.getParameterFingerprint();

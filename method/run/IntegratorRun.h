@@ -85,6 +85,7 @@ private:
     bool areConstraintsOthers() const;
     bool canTakeSettings() const;
     void takeSettings();
+    void takeForcesOfOthers();
     void takeSaved();
     void prepare(bool areForcesInvalid, bool isForStep = false);
     std::vector<double> getReferences();

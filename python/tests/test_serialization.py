@@ -15,10 +15,11 @@ import numpy as np
 import openmm
 import openmmvrattle
 import pytest
-from dense_reference import open_context, positions_of, time_of, velocities_of
+from dense_reference import open_context, positions_of, time_of, value, velocities_of
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import TestSystem, alanine_dipeptide, rigid_waters
+from run_support import needs_opencl
 
 pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
 
@@ -240,8 +241,9 @@ def test_cast_and_isinstance() -> None:
     assert not VariableStepRattleIntegrator.isinstance(verlet)
     with pytest.raises(TypeError, match="VerletIntegrator"):
         VariableStepRattleIntegrator.cast(verlet)
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match="a str is not a VariableStepRattleIntegrator"):
         VariableStepRattleIntegrator.cast("an integrator")
+    assert not VariableStepRattleIntegrator.isinstance("an integrator")
     assert verlet.getStepSize()._value == STEP
 
 
@@ -327,6 +329,44 @@ def test_a_checkpoint_on_every_platform(water: TestSystem, platform: str) -> Non
     new = open_test_context(water, other, platform, with_state=False)
     new.loadCheckpoint(checkpoint)
     assert trace(new, other, 50) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+def test_a_checkpoint_after_a_parameter_has_changed(platform: str, is_set: bool) -> None:
+    """The density is scaled with u, also where somebody has computed the new forces before, or changes a setting."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("k*((x-1)^2 + 2*(y-1)^2 + (z-1)^2)")
+    field.addGlobalParameter("k", 100)
+    for particle in range(3):
+        system.addParticle(12.0)
+        field.addParticle(particle)
+    system.addConstraint(0, 1, 0.1)
+    system.addForce(field)
+
+    def open_here() -> tuple[openmm.Context, VariableStepRattleIntegrator]:
+        monitors = [VariableStepRattleIntegrator.AppliedForce]
+        integrator = VariableStepRattleIntegrator(0.002, VariableStepRattleIntegrator.Explicit, 0, 0, monitors=monitors)
+        properties = {"Precision": "double"} if platform == "OpenCL" else {}
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+        context.setPositions([[1.0, 1, 1.1], [1.1, 1, 1.1], [1.3, 0.8, 1]])
+        return context, integrator
+
+    context, integrator = open_here()
+    integrator.step(10)
+    before = value(integrator.getStepSize())
+    context.setParameter("k", 150)
+    context.getState(energy=True)
+    if is_set:
+        integrator.setConstraintTolerance(1e-7)
+    other, successor = open_here()
+    other.loadCheckpoint(context.createCheckpoint())
+    for each in (integrator, successor):
+        sizes = []
+        for _ in range(5):
+            each.step(1)
+            sizes.append(value(each.getStepSize()))
+        assert np.array(sizes) / before == pytest.approx(1 / 1.5, rel=0.05)
 
 
 def test_a_checkpoint_with_a_thermostat(molecule: TestSystem) -> None:
