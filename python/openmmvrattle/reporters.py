@@ -284,7 +284,9 @@ def _advance_by_time(integrator: Any, context: openmm.Context, time: float) -> N
     largest = _called(integrator, "getMaximumStepSize")
     if largest:
         # A few steps at a time as far as they cannot lead beyond, to give Python a chance to respond to Ctrl-C.
-        while time - plain(context.getTime(), unit.picosecond) > 30.0 * largest:
+        last = -math.inf
+        while time - (now := plain(context.getTime(), unit.picosecond)) > 30.0 * largest and now > last:
+            last = now  # at times so large that steps are lost in their rounding stepTo says so
             integrator.step(10)
     integrator.stepTo(time)
 

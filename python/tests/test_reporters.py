@@ -572,3 +572,10 @@ def test_an_integrator_from_a_file(kind: type, tmp_path: Path) -> None:
     assert [row["Time (ps)"] for row in reporter.rows] == [0.01, 0.02]
     assert all(row["Step Density"] != 1 for row in reporter.rows)
     assert type(simulation.integrator) is kind
+
+
+def test_a_time_beyond_the_digits_of_a_step() -> None:
+    simulation = make_simulation(VariableStepRattleIntegrator(0.001, automatic=True))
+    simulation.context.setTime(1e15)
+    with pytest.raises(openmm.OpenMMException, match="makes no way"):
+        run_for_time(simulation, 16)
