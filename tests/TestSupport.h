@@ -5,7 +5,10 @@
 #define OPENMMVRATTLE_TESTSUPPORT_H_
 
 #include "openmm/OpenMMException.h"
+#include "openmm/Vec3.h"
 #include "openmm/internal/AssertionUtilities.h"
+#include <algorithm>
+#include <cmath>
 #include <functional>
 #include <iostream>
 #include <string>
@@ -36,6 +39,15 @@ inline int runTests(const TestList& tests) {
     }
     std::cout << tests.size() - numFailed << " passed, " << numFailed << " failed" << std::endl;
     return numFailed == 0 ? 0 : 1;
+}
+
+/** The largest difference between coordinates of two sets of vectors. */
+inline double largestDifference(const std::vector<OpenMM::Vec3>& a, const std::vector<OpenMM::Vec3>& b) {
+    double largest = 0;
+    for (size_t i = 0; i < a.size(); i++)
+        for (int j = 0; j < 3; j++)
+            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
+    return largest;
 }
 
 /**

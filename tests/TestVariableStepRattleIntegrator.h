@@ -107,14 +107,6 @@ inline double largestConstraintError(Context& context) {
     return largest;
 }
 
-inline double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
-    double largest = 0;
-    for (size_t i = 0; i < a.size(); i++)
-        for (int j = 0; j < 3; j++)
-            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
-    return largest;
-}
-
 // One context of a test system on the platform under test. The integrator projects the velocities itself, but the energies
 // before and after that cannot be compared.
 struct Run {

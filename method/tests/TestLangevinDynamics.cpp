@@ -83,7 +83,7 @@ Vectors drawNoise(Example& e) {
     return noise;
 }
 
-double largestDifference(const Vectors& a, const Vectors& b) {
+double largestDistance(const Vectors& a, const Vectors& b) {
     double largest = 0;
     for (size_t i = 0; i < a.size(); i++)
         largest = std::max(largest, std::sqrt((a[i] - b[i]).dot(a[i] - b[i])));
@@ -210,9 +210,9 @@ void testRetracesSteps() {
         dynamics.setNoise(noise);
         ASSERT_EQUAL(LangevinSettings::getSubsteps(k), takeStep(dynamics));
         const PlainStep plain(e, settings, start, velocities, noise, k, false);
-        ASSERT(largestDifference(plain.q, dynamics.getPositions()) < 1e-13);
-        ASSERT(largestDifference(plain.v, dynamics.getVelocities()) < 1e-10);
-        ASSERT(largestDifference(start, dynamics.getPositions()) > 1e-3);
+        ASSERT(largestDistance(plain.q, dynamics.getPositions()) < 1e-13);
+        ASSERT(largestDistance(plain.v, dynamics.getVelocities()) < 1e-10);
+        ASSERT(largestDistance(start, dynamics.getPositions()) > 1e-3);
 
         const double damping = settings.langevin.friction * settings.stepSize;
         const double scale = std::sqrt(BOLTZMANN * settings.langevin.temperature * -std::expm1(-2 * damping));
@@ -222,9 +222,9 @@ void testRetracesSteps() {
         dynamics.setNoise(back);
         dynamics.reverse();
         takeStep(dynamics);
-        ASSERT(largestDifference(start, dynamics.getPositions()) < 1e-12);
+        ASSERT(largestDistance(start, dynamics.getPositions()) < 1e-12);
         dynamics.reverse();
-        ASSERT(largestDifference(velocities, dynamics.getVelocities()) < 1e-9);
+        ASSERT(largestDistance(velocities, dynamics.getVelocities()) < 1e-9);
     }
 }
 
@@ -242,8 +242,8 @@ void testNeedsOneProjection() {
             dynamics.setNoise(noise);
             takeStep(dynamics);
             const PlainStep four(e, settings, start, velocities, noise, k, true);
-            ASSERT(largestDifference(four.q, dynamics.getPositions()) < 1e-12);
-            ASSERT(largestDifference(four.v, dynamics.getVelocities()) < 1e-9);
+            ASSERT(largestDistance(four.q, dynamics.getPositions()) < 1e-12);
+            ASSERT(largestDistance(four.v, dynamics.getVelocities()) < 1e-9);
         }
     }
 }
@@ -273,7 +273,7 @@ void testTriesAgainWithTheSameNoise() {
             k++;
         numRetried += passes > substeps;
         const PlainStep plain(e, settings, start, velocities, noise, k, false);
-        ASSERT(largestDifference(plain.q, dynamics.getPositions()) < 1e-11);
+        ASSERT(largestDistance(plain.q, dynamics.getPositions()) < 1e-11);
     }
     std::cout << numRetried << " of 20 steps were tried again" << std::endl;
     ASSERT(numRetried > 3);
@@ -434,7 +434,7 @@ void testThreads() {
         ends.push_back(dynamics.getPositions());
     }
     ASSERT(ends[0] == ends[1] && ends[0] == ends[2]);
-    ASSERT(largestDifference(ends[0], makeComb(6000).positions) > 1e-4);
+    ASSERT(largestDistance(ends[0], makeComb(6000).positions) > 1e-4);
 }
 
 } // namespace

@@ -130,14 +130,6 @@ Platform& reference() {
     return Platform::getPlatform("Reference");
 }
 
-double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
-    double largest = 0;
-    for (size_t i = 0; i < a.size(); i++)
-        for (int j = 0; j < 3; j++)
-            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
-    return largest;
-}
-
 // From one state in the middle of a run: one step, and a hundred, in which particles leave the box and the atoms are reordered.
 void testAgreement() {
     for (int chain : {0, 12}) {

@@ -17,14 +17,6 @@ namespace {
 
 typedef VariableStepRattleIntegrator Integrator_;
 
-double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
-    double largest = 0;
-    for (size_t i = 0; i < a.size(); i++)
-        for (int j = 0; j < 3; j++)
-            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
-    return largest;
-}
-
 // Collisions come as often as they should, for the time that has passed, and to both particles of a dumbbell; at zero temperature they
 // stop what flies freely.
 void testCollisions() {

@@ -160,14 +160,6 @@ struct Molecules {
     }
 };
 
-double largestDifference(const vector<Vec3>& a, const vector<Vec3>& b) {
-    double largest = 0;
-    for (size_t i = 0; i < a.size(); i++)
-        for (int j = 0; j < 3; j++)
-            largest = std::max(largest, std::fabs(a[i][j] - b[i][j]));
-    return largest;
-}
-
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
 // VRattleRun and DeviceSteps side by side; both get their forces from one Context on OpenCL.
