@@ -11,6 +11,7 @@
 #include <cmath>
 #include <functional>
 #include <iostream>
+#include <sstream>
 #include <string>
 #include <utility>
 #include <vector>
@@ -63,6 +64,14 @@ inline std::function<void(const std::function<void(int)>&)> runInReverse(int num
         for (int thread = numThreads - 1; thread >= 0; thread--)
             task(thread);
     };
+}
+
+/** Assert that something is no more than that; the message has both numbers. */
+inline void requireAtMost(double largest, double found, const std::string& what) {
+    std::stringstream message;
+    message << what << ": " << found << ", more than " << largest;
+    if (!(found <= largest))
+        throw OpenMM::OpenMMException(message.str());
 }
 
 /** Assert that an action throws an exception whose text contains something. */

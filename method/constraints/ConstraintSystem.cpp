@@ -46,6 +46,28 @@ void ConstraintSystem::writeParameters(int expression, const std::map<std::strin
         values[place++] = parameter.second;
 }
 
+ExpressionParameters ConstraintSystem::toGivenOrder(const ExpressionParameters& theta) const {
+    ExpressionParameters given = theta;
+    int next = 0;
+    for (size_t e = 0; e < expressions.size(); e++)
+        for (size_t i = 0; i < expressions[e].parameters.size(); i++, next++) {
+            given.values[next] = theta.values[firstParameters[e] + i];
+            given.rates[next] = theta.rates[firstParameters[e] + i];
+        }
+    return given;
+}
+
+ExpressionParameters ConstraintSystem::fromGivenOrder(const ExpressionParameters& given) const {
+    ExpressionParameters theta = given;
+    int next = 0;
+    for (size_t e = 0; e < expressions.size(); e++)
+        for (size_t i = 0; i < expressions[e].parameters.size(); i++, next++) {
+            theta.values[firstParameters[e] + i] = given.values[next];
+            theta.rates[firstParameters[e] + i] = given.rates[next];
+        }
+    return theta;
+}
+
 ExpressionConstraint ConstraintSystem::getExpression(int index, const ExpressionParameters& theta) const {
     const int e = givenIndex[index] - numGivenDistances;
     ExpressionConstraint result = expressions[e];

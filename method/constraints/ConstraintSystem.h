@@ -161,6 +161,9 @@ public:
     /** Write the parameters of an expression, counted in the order of the constructor, into the values of all. */
     void writeParameters(int expression, const std::map<std::string, double>& parameters,
                          std::vector<double>& values) const;
+    /** Parameters and rates in the order of the constructor's expressions, for others who know them so, and back. */
+    ExpressionParameters toGivenOrder(const ExpressionParameters& theta) const;
+    ExpressionParameters fromGivenOrder(const ExpressionParameters& given) const;
     /**
      * The way from parameters theta to others, such that following it changes g as going there does: the difference, but for a
      * parameter that stands for an angle and has been set back by a full turn that is what is left of it.

@@ -56,7 +56,7 @@ double ParameterMotion::findJump(ConstraintSolver& solver, const vector<Vec3>& v
     for (size_t k = 0; k < change.size(); k++) {
         const double before = theta.rates[k];
         double& rate = jumped.rates[k];
-        if (std::fabs(rate - before) > 0.5 * std::max(std::fabs(rate), std::fabs(before)))
+        if (std::fabs(rate - before) > SUDDEN_CHANGE * std::max(std::fabs(rate), std::fabs(before)))
             isSudden = true;
         else
             rate = before;

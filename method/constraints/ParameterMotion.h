@@ -13,6 +13,8 @@ namespace OpenMMVRattle {
 /** How the parameters theta of expressions move in a step: at constant rates, from theta[n] to those that have been set for its end. */
 class ParameterMotion {
 public:
+    /** A rate of a parameter that changes by more than this part of itself is a sudden one; one that doubles is not. */
+    static constexpr double SUDDEN_CHANGE = 0.51;
     explicit ParameterMotion(const ConstraintSystem& system);
     /** theta[n+1], what the next step leads to. */
     std::vector<double> target;

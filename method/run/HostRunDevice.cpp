@@ -108,9 +108,13 @@ template <class Method> void HostRunDevice<Method>::setSettings(const Integrator
     setMethod(from);
     forceGroups = from.getActingForceGroups();
     monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
+    HostRunDevice::setParameters(from.expressions);
+}
+
+template <class Method> void HostRunDevice<Method>::setParameters(const vector<ExpressionConstraint>& given) {
     for (size_t i = 0; i < expressions.size(); i++)
-        if (expressions[i].parameters != from.expressions[i].parameters) {
-            expressions[i].parameters = from.expressions[i].parameters;
+        if (expressions[i].parameters != given[i].parameters) {
+            expressions[i].parameters = given[i].parameters;
             method.setParameters((int) i, expressions[i].parameters);
         }
 }
@@ -398,6 +402,11 @@ template <class Method> vector<double> HostRunDevice<Method>::getMultipliers() {
     vector<double> result;
     method.getConstraintSystem().getGivenMultipliers(method.getMultipliers(), result);
     return result;
+}
+
+template <class Method> vector<double> HostRunDevice<Method>::getExpressionMultipliers() {
+    const vector<double> all = getMultipliers();
+    return vector<double>(all.end() - expressions.size(), all.end());
 }
 
 template <class Method> double HostRunDevice<Method>::computeKineticEnergy() {

@@ -39,6 +39,7 @@ public:
         method.setParallel(parallel, numThreads);
     }
     void setSettings(const IntegratorSettings& settings) override;
+    void setParameters(const std::vector<ExpressionConstraint>& given) override;
     std::vector<double> getReferences() override;
     void setReferences(const std::vector<double>& references) override;
     bool updateState() override;
@@ -57,6 +58,7 @@ public:
     double getTime() override;
     long long getStepCount() override;
     std::vector<double> getMultipliers() override;
+    std::vector<double> getExpressionMultipliers() override;
     double computeKineticEnergy() override;
     long long getNumForceEvaluations() override;
     long long getNumSolverIterations() override;

@@ -66,6 +66,10 @@ void IntegratorRun::settingsChanged() {
     areSettingsChanged = true;
 }
 
+void IntegratorRun::parametersChanged() {
+    areValuesChanged = true;
+}
+
 void IntegratorRun::nominalStepChanged() {
     settingsChanged();
     toldSize = 0.0;
@@ -100,9 +104,28 @@ bool IntegratorRun::canTakeSettings() const {
     return settings.isConsistent() && !areConstraintsOthers();
 }
 
+// A run whose constraints move goes through here in each step.
+void IntegratorRun::takeParameters() {
+    if (areValuesChanged && !settings.hasSameParameters(applied.expressions)) {
+        try {
+            takeForcesOfOthers();
+            device.setParameters(settings.expressions);
+        }
+        catch (const StepFailure& failure) {
+            throw OpenMMException(getName() + ": " + failure.what());
+        }
+        for (size_t i = 0; i < settings.expressions.size(); i++)
+            applied.expressions[i].parameters = settings.expressions[i].parameters;
+        areParametersNew = true;
+    }
+    areValuesChanged = false;
+}
+
 void IntegratorRun::takeSettings() {
-    if (!areSettingsChanged)
+    if (!areSettingsChanged) {
+        takeParameters();
         return;
+    }
     settings.requireConsistent();
     if (areConstraintsOthers())
         throw OpenMMException(getName() +
@@ -120,12 +143,12 @@ void IntegratorRun::takeSettings() {
         (!settings.usesMonitorForceGroup() || settings.monitorForceGroup == applied.monitorForceGroup);
     if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups())
         task = Task::Start;
-    areParametersNew = areParametersNew || !settings.hasSameParameters(applied);
+    areParametersNew = areParametersNew || !settings.hasSameParameters(applied.expressions);
     // A start has met the tolerance that there was.
     if (isAtStart && settings.constraintTolerance != applied.constraintTolerance)
         task = Task::Start;
     applied = settings;
-    areSettingsChanged = false;
+    areSettingsChanged = areValuesChanged = false;
 }
 
 // A device that has no forces but those that were computed last may have those of new parameters already: before anything else is
@@ -367,6 +390,11 @@ double IntegratorRun::getMonitorValue(int index) {
 vector<double> IntegratorRun::getMultipliers() {
     prepare(false);
     return device.getMultipliers();
+}
+
+double IntegratorRun::getExpressionMultiplier(int index) {
+    prepare(false);
+    return device.getExpressionMultipliers().at(index);
 }
 
 vector<double> IntegratorRun::getRandomState() {

@@ -30,6 +30,8 @@ public:
 
     /** Take note that the settings have changed; they are in force with the next step. */
     void settingsChanged();
+    /** Take note that values of parameters of expressions have changed, which the next step leads to. */
+    void parametersChanged();
     /** Take note that the nominal step has been set: it is what getStepSize() returns until a step is taken. */
     void nominalStepChanged();
     /** Take note that the user has changed the Context: unless it is in the state of a saved run, the next step starts afresh. */
@@ -52,6 +54,7 @@ public:
     double getReference(int index);
     double getMonitorValue(int index);
     std::vector<double> getMultipliers();
+    double getExpressionMultiplier(int index);
     /** As of the device, with a seed that has been set since the last step. */
     std::vector<double> getRandomState();
     /** What is reported as the kinetic energy of the Context; at constant temperature it is one of the method's state. */
@@ -86,6 +89,7 @@ private:
     bool canTakeSettings() const;
     void takeSettings();
     void takeForcesOfOthers();
+    void takeParameters();
     void takeSaved();
     void prepare(bool areForcesInvalid, bool isForStep = false);
     std::vector<double> getReferences();
@@ -98,6 +102,7 @@ private:
     const int numParticles;
     const unsigned long long system;
     bool areSettingsChanged;
+    bool areValuesChanged = false; // of parameters of expressions
     bool isAtStart;        // no step has been taken since the last start
     bool areParametersNew; // those of expressions, since the last step or start
     bool areForcesChanged; // since the last step; of no interest where the task computes them anyway

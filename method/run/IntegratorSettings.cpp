@@ -66,18 +66,20 @@ void IntegratorSettings::requireConsistent() const {
     throw OpenMMException(message.str());
 }
 
-bool IntegratorSettings::hasSameConstraints(const IntegratorSettings& other) const {
+bool OpenMMVRattle::haveSameParts(const ExpressionConstraint& a, const ExpressionConstraint& b) {
     auto haveSameNames = [](const auto& x, const auto& y) { return x.first == y.first; };
-    return std::equal(expressions.begin(), expressions.end(), other.expressions.begin(), other.expressions.end(),
-                      [&](const ExpressionConstraint& a, const ExpressionConstraint& b) {
-                          return a.expression == b.expression && a.particles == b.particles &&
-                                 std::equal(a.parameters.begin(), a.parameters.end(), b.parameters.begin(),
-                                            b.parameters.end(), haveSameNames);
-                      });
+    return a.expression == b.expression && a.particles == b.particles &&
+           std::equal(a.parameters.begin(), a.parameters.end(), b.parameters.begin(), b.parameters.end(),
+                      haveSameNames);
 }
 
-bool IntegratorSettings::hasSameParameters(const IntegratorSettings& other) const {
+bool IntegratorSettings::hasSameConstraints(const IntegratorSettings& other) const {
+    return std::equal(expressions.begin(), expressions.end(), other.expressions.begin(), other.expressions.end(),
+                      haveSameParts);
+}
+
+bool IntegratorSettings::hasSameParameters(const std::vector<ExpressionConstraint>& others) const {
     return std::equal(
-        expressions.begin(), expressions.end(), other.expressions.begin(), other.expressions.end(),
+        expressions.begin(), expressions.end(), others.begin(), others.end(),
         [](const ExpressionConstraint& a, const ExpressionConstraint& b) { return a.parameters == b.parameters; });
 }

@@ -10,6 +10,7 @@
 
 namespace OpenMMVRattle {
 
+struct ExpressionConstraint;
 struct IntegratorSettings;
 struct RunState;
 
@@ -46,6 +47,8 @@ public:
      * @throws StepFailure    if the System cannot have one of the monitors
      */
     virtual void setSettings(const IntegratorSettings& settings) = 0;
+    /** Take over other values of the parameters of expressions, and nothing else. */
+    virtual void setParameters(const std::vector<ExpressionConstraint>& given) = 0;
     /** The reference values in force of the monitors, or of the two of automatic step control; 0 where there is none yet. */
     virtual std::vector<double> getReferences() = 0;
     /** Put reference values in force, as from a saved run or a trial run; 0 for those that are not known. */
@@ -159,6 +162,8 @@ public:
     virtual std::vector<double> getMonitorValues() = 0;
     /** Lambda(q[n],p[n]), for the System's constraints and behind them for the expressions, in the users' units. */
     virtual std::vector<double> getMultipliers() = 0;
+    /** Those of the expressions alone. */
+    virtual std::vector<double> getExpressionMultipliers() = 0;
     /** The kinetic energy of the Context's velocities (kJ/mol). */
     virtual double computeKineticEnergy() = 0;
     /** Whether the next step goes on with the forces that somebody else has computed, who is to compute them with each energy. */

@@ -48,8 +48,12 @@ void VRattleRun::adoptParameters() {
 }
 
 void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
-                       double energy, const StepMemory& memory) {
-    begin(positions, velocities, forces, energy);
+                       double energy, const ExpressionParameters& theta, const StepMemory& memory) {
+    attempt([&] {
+        now.theta = theta;
+        takeOver(positions, velocities, forces, energy);
+        control->begin();
+    });
     now.v = velocities; // which have been projected, and so changed in the last bits
     adopt(memory);
     formHalfStepVelocities();

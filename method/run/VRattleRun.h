@@ -45,10 +45,14 @@ public:
     void resume(const StepState& state, const StepMemory& memory);
     /**
      * Go on from an on-step state that somebody else's steps have led to, in the middle of a sequence of densities with the same
-     * settings and references. The velocities are taken as they are; the half-step momentum is formed from them.
+     * settings and references. The velocities are taken as they are; the half-step momentum is formed from them. Parameters that are
+     * set stay what the next step leads to.
+     *
+     * @param theta    theta[n], with the rates of the last step
      */
     void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const StepMemory& memory);
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const ExpressionParameters& theta,
+               const StepMemory& memory);
     /** Take over what somebody else has carried on; the state is another. */
     void adopt(const StepMemory& memory) {
         control->adopt(memory);

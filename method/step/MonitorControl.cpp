@@ -10,13 +10,6 @@ using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
-namespace {
-
-// A relative change of u that starts no oscillation to speak of: the density is not scaled for it, which would cost reversibility.
-const double SMALL_JUMP = 0.01;
-
-} // namespace
-
 MonitorControl::MonitorControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
         StepControl(constraints, solver, now), monitor(constraints), firstStep(constraints, solver, monitor, now),
         numRescues(0), densityScale(1), isRescued(false), atHalfStep{solver.next.lambda, solver.next.lambda} {

@@ -12,6 +12,8 @@ namespace OpenMMVRattle {
 /** The paper's control: monitors U_k, u = B(U/U_ref) of them, and a symmetric recursion of the density, (3.14), (3.15) or bounded. */
 class MonitorControl : public StepControl {
 public:
+    /** A relative change of u that starts no oscillation to speak of: the density is not scaled for it, which would cost reversibility. */
+    static constexpr double SMALL_JUMP = 0.01;
     MonitorControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now);
     std::vector<double> getReferences() const override {
         return monitor.getReferences();

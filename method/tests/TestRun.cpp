@@ -33,6 +33,9 @@ public:
         calls += 's';
         references.assign(settings.getNumReferences(), 0.0);
     }
+    void setParameters(const vector<ExpressionConstraint>&) override {
+        calls += 'p';
+    }
     vector<double> getReferences() override {
         look();
         return references;
@@ -113,6 +116,9 @@ public:
     vector<double> getMultipliers() override {
         look();
         return {};
+    }
+    vector<double> getExpressionMultipliers() override {
+        return getMultipliers();
     }
     double computeKineticEnergy() override {
         return 0;
@@ -229,7 +235,7 @@ void testParameters() {
     e.device.takeCalls();
     auto setParameter = [&](double value) {
         e.settings.expressions[0].parameters["d"] = value;
-        run.settingsChanged();
+        run.parametersChanged();
     };
     // Before the first step whoever asks for numbers asks for those where the constraint holds; a step goes there.
     run.getMultipliers();
@@ -239,7 +245,13 @@ void testParameters() {
     run.step(1);
     setParameter(4);
     run.step(1);
-    ASSERT_EQUAL(string("AsAs+.s+."), e.device.takeCalls());
+    ASSERT_EQUAL(string("ApAp+.p+."), e.device.takeCalls());
+    setParameter(4); // which it is
+    run.step(1);
+    setParameter(5);
+    run.settingsChanged(); // all of them, then
+    run.step(2);
+    ASSERT_EQUAL(string("+.s++."), e.device.takeCalls());
     run.forcesChanged();
     run.step(2);
     run.getMultipliers();

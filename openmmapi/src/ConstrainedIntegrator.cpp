@@ -231,8 +231,12 @@ void ConstrainedIntegrator::setExpressionConstraintParameters(int index, const s
                                                               const std::map<string, double>& parameters) {
     checkExpressionConstraintIndex(index);
     checkConstraint(expression, particles, parameters);
-    settings->expressions[index] = {expression, particles, parameters};
-    settingsChanged();
+    ExpressionConstraint changed = {expression, particles, parameters};
+    std::swap(settings->expressions[index], changed);
+    if (!haveSameParts(settings->expressions[index], changed))
+        settingsChanged();
+    else if (run != nullptr)
+        run->parametersChanged();
 }
 
 void ConstrainedIntegrator::setExpressionParameterValue(int index, const string& name, double value) {
@@ -245,10 +249,9 @@ void ConstrainedIntegrator::setExpressionParameterValue(int index, const string&
 }
 
 double ConstrainedIntegrator::getExpressionConstraintMultiplier(int index) const {
-    requireRun();
+    IntegratorRun& inContext = requireRun();
     checkExpressionConstraintIndex(index);
-    const int numDistances = context->getSystem().getNumConstraints();
-    return getMultipliers().at(numDistances + index);
+    return inContext.getExpressionMultiplier(index);
 }
 
 // ----------------------------------------------------------------------------------------------------------- the run

@@ -40,6 +40,8 @@ class _Use:
 
     integrator: str
     make: Callable[[], Any]
+    prepare_step: Callable[[Any, int], None] | None = None
+    """Called with the integrator and the number of each step, if that is to be taken by itself."""
 
 
 def add_parser(commands: Any) -> None:
@@ -152,12 +154,21 @@ def _uses() -> dict[str, _Use]:
         integrator.addConstraint("z1", [2])
         return integrator
 
+    def with_height() -> Any:
+        integrator = variable()
+        integrator.addConstraint("z1-height", [2], {"height": 0.0})
+        return integrator
+
+    def lift(integrator: Any, step: int) -> None:
+        integrator.setExpressionParameterValue(0, "height", 0.0001 * step)
+
     ours, langevin = "VariableStepRattleIntegrator", "VariableStepRattleLangevinIntegrator"
     custom = "CustomVariableStepRattleIntegrator"
     return {
         "monitors": _Use(ours, variable),
         "automatic": _Use(ours, lambda: variable(automatic=True)),
         "expressions": _Use(ours, with_expression),
+        "moving expressions": _Use(ours, with_height, lift),
         "constant temperature": _Use(langevin, lambda: getattr(openmmvrattle, langevin)(300, 1, 0.001)),
         "Python alone": _Use(custom, lambda: getattr(openmmvrattle, custom)(0.001)),
     }
@@ -178,7 +189,12 @@ def _try(use: _Use, on: str) -> tuple[str | None, str | None]:
         context = make_context(system, integrator, on)
         context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 1.0, 0.0]])
         context.setVelocities([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
-        integrator.step(_STEPS)
+        if use.prepare_step is None:
+            integrator.step(_STEPS)
+        else:
+            for step in range(_STEPS):
+                use.prepare_step(integrator, step)
+                integrator.step(1)
         if not isinstance(integrator, openmm.CustomIntegrator):
             return None, "device" if integrator.isOnDevice() else "host"
     except Exception as error:

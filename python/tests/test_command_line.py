@@ -410,12 +410,13 @@ def test_info() -> None:
     for name in content["platforms_not_here"]:
         assert f"- {name}: pip install" in result.stdout
     for name, uses in content["steps"].items():
-        assert set(uses) == {"monitors", "automatic", "expressions", "constant temperature", "Python alone"}
+        ours = {"monitors", "automatic", "expressions", "moving expressions", "constant temperature"}
+        assert set(uses) == ours | {"Python alone"}
         if name in ("Reference", "CPU"):
-            assert all(uses[use] == "host" for use in list(uses)[:4])
-            assert re.search(rf"^  {name} +yes +yes +yes +yes +yes$", result.stdout, re.MULTILINE)
+            assert all(uses[use] == "host" for use in list(uses)[:5])
+            assert re.search(rf"^  {name} +yes +yes +yes +yes +yes +yes$", result.stdout, re.MULTILINE)
         elif content["platforms"][name]["VariableStepRattleIntegrator"] is None:  # there is a device
-            assert uses["monitors"] == "device"
+            assert uses["monitors"] == uses["moving expressions"] == "device"
             assert re.search(rf"^  {name} +GPU ", result.stdout, re.MULTILINE)
     assert content["versions"]["openmm-vrattle"] == openmmvrattle.__version__
     assert content["versions"]["OpenMM"].startswith("8.6")

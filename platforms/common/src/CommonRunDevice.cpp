@@ -124,24 +124,33 @@ template <class Host> bool CommonRunDevice<Host>::canStepOnDevice() {
     return steps != nullptr && !reach.isUnknown && ahead == nullptr && canGoOnDevice();
 }
 
-// Where parameters of expressions are others now molecules may be so too, that were identical; then OpenMM puts them into another order.
-template <class Host> void CommonRunDevice<Host>::setDeviceParameters() {
-    if (expressions.empty() || !steps->setParameters(expressions))
+// Where parameters of expressions are others now molecules may be so too, that were identical; then OpenMM puts all atoms into another
+// order, for which nothing on the device is prepared between two steps.
+template <class Host> void CommonRunDevice<Host>::tellOfParameters() {
+    areParametersNew = true;
+    if (steps == nullptr)
         return;
     ContextSelector selector(compute);
     expressionInfo->setParameters(expressions);
-    compute.invalidateMolecules(expressionInfo);
+    if (compute.invalidateMolecules(expressionInfo, false, true) && isOnDevice)
+        takeToHost();
 }
 
 // The state goes to the device, where positions, velocities and forces are.
 template <class Host> void CommonRunDevice<Host>::beginOnDevice() {
-    setDeviceParameters();
     ensureForces();
     if (!areSettingsOnDevice)
         steps->setSettings(makeDeviceSettings());
     areSettingsOnDevice = true;
-    hasBegun = steps->begin(state, groupEnergy);
+    const ExpressionParameters theta = method.getConstraintSystem().toGivenOrder(method.getParameters());
+    hasBegun = steps->begin(state, groupEnergy, &theta);
     hasReport = false;
+    areParametersNew = true;
+}
+
+template <class Host> ExpressionParameters CommonRunDevice<Host>::getDeviceParameters() {
+    return expressions.empty() ? method.getParameters()
+                               : method.getConstraintSystem().fromGivenOrder(steps->getParameters());
 }
 
 // The host gets the device's state as well.
@@ -165,6 +174,8 @@ template <class Host> void CommonRunDevice<Host>::takeToHost() {
 template <class Host> void CommonRunDevice<Host>::step(double maxTime) {
     if (maxTime < NO_LIMIT)
         settle();
+    if (isOnDevice && !hasBegun && !expressions.empty())
+        takeToHost(); // which knows how parameters move
     if (!isOnDevice && canStepOnDevice()) {
         state = makeDeviceState();
         isOnDevice = true;
@@ -192,6 +203,9 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
     ensureForces();
     isOnHost = hasReport = isChangePending = false;
     lastMaxTime = maxTime;
+    if (areParametersNew)
+        steps->moveParameters(expressions);
+    areParametersNew = false;
     steps->advance(maxTime - vectors->getTime());
     numAsked++;
     try {
@@ -312,8 +326,20 @@ template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSe
                   << " is below what the precision of this Context allows; " << possible.constraintTolerance
                   << " is used" << std::endl;
     }
+    const bool areParametersOthers = !possible.hasSameParameters(expressions);
     Host::setSettings(possible);
     areSettingsOnDevice = false;
+    if (areParametersOthers)
+        tellOfParameters();
+}
+
+// The steps go on where they were.
+template <class Host> void CommonRunDevice<Host>::setParameters(const vector<ExpressionConstraint>& given) {
+    settle();
+    if (isOnDevice && !takesMovingParameters())
+        takeToHost();
+    Host::setParameters(given);
+    tellOfParameters();
 }
 
 template <class Host> void CommonRunDevice<Host>::setReferences(const vector<double>& references) {
@@ -483,6 +509,12 @@ template <class Host> bool CommonRunDevice<Host>::readMonitorValues(vector<doubl
 template <class Host> vector<double> CommonRunDevice<Host>::getMultipliers() {
     bringToHost();
     return Host::getMultipliers();
+}
+
+// Which a run that pulls asks for in each step.
+template <class Host> vector<double> CommonRunDevice<Host>::getExpressionMultipliers() {
+    settle();
+    return isOnDevice && hasBegun && !isOnHost ? steps->getExpressionMultipliers() : Host::getExpressionMultipliers();
 }
 
 template <class Host> double CommonRunDevice<Host>::computeKineticEnergy() {

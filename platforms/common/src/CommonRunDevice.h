@@ -28,6 +28,7 @@ public:
     CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
                     const IntegratorSettings& settings);
     void setSettings(const IntegratorSettings& settings) override;
+    void setParameters(const std::vector<ExpressionConstraint>& given) override;
     void setReferences(const std::vector<double>& references) override;
     bool updateState() override;
     RunDevice::Change findChange() override;
@@ -43,6 +44,7 @@ public:
     RunDevice::LastStep getLastStep() override;
     double getTime() override;
     std::vector<double> getMultipliers() override;
+    std::vector<double> getExpressionMultipliers() override;
     double computeKineticEnergy() override;
     bool usesForcesOfOthers() override {
         return true;
@@ -71,6 +73,10 @@ protected:
     bool differ(const Vectors& a, const Vectors& b) override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
+    /** Whether the kernels of the steps in force know parameters of expressions that move. */
+    virtual bool takesMovingParameters() {
+        return false;
+    }
     /** The settings in force, for the GPU. */
     virtual DeviceSteps::Settings makeDeviceSettings() = 0;
     /** What there is of the host's state beside positions, velocities and forces. */
@@ -82,6 +88,8 @@ protected:
     }
     /** Whether it matters that all velocities have changed by the same. */
     virtual bool doesFrameMatter() = 0;
+    /** theta[n] of the device's state. */
+    ExpressionParameters getDeviceParameters();
     /** How many steps may be done in vain because one before them has failed. */
     virtual int getMostStepsUntilLook() const {
         return std::numeric_limits<int>::max();
@@ -103,7 +111,7 @@ private:
     void changeOnDevice(Control::Change change);
     void resolveChange();
     void repeatActions();
-    void setDeviceParameters();
+    void tellOfParameters();
     void beginOnDevice();
     void stepOnDevice(double maxTime);
     void accept(const DeviceSteps::Report& report);
@@ -123,6 +131,7 @@ private:
     bool areSettingsOnDevice, hasReport;
     bool isChangePending = false; // since the last step; whether the device could go on with it nobody has looked at
     bool haveActed = false;       // Forces, since the last look for a change
+    bool areParametersNew = false; // what the next step leads to may be others than the device knows
     bool hasStepped = false; // by the last step()
     int numAsked;       // steps since the last settle()
     int stepsUntilLook; // how many there may be

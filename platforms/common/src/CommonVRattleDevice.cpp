@@ -24,9 +24,14 @@ CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::C
 bool CommonVRattleDevice::canGoOnDevice() {
     const vector<double> references = vrattle.getReferences();
     // Automatic step control finds its references on the way.
-    return vrattle.hasStarted() && vrattle.areParametersAtRest() &&
+    return vrattle.hasStarted() && (takesMovingParameters() || vrattle.areParametersAtRest()) &&
            (settings.isAutomatic ||
             std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
+}
+
+// With automatic step control the densities start anew where they begin to move, or stop.
+bool CommonVRattleDevice::takesMovingParameters() {
+    return !settings.isAutomatic;
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
@@ -70,7 +75,8 @@ StepMemory CommonVRattleDevice::memoryOf(const DeviceSteps::State& others) const
 }
 
 void CommonVRattleDevice::adopt(const State& state, const DeviceSteps::State& others) {
-    vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, memoryOf(others));
+    vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, getDeviceParameters(),
+                  memoryOf(others));
 }
 
 void CommonVRattleDevice::carryOn(const DeviceSteps::State& others) {

@@ -87,7 +87,8 @@ DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& cl
         isWide(context.getSupportsDoublePrecision()),
         groupSize(StepProgram::getGroupSize(!large.isEmpty() || expressions)), numGroups(0), numPartials(0),
         numFused(0), numLargeLaunches(0), numLaunches(0), half(0), stepNumber(0), numTrials(MOST_TRIALS), seed(0),
-        numDrawn(0), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0), areVelocitiesKept(false) {
+        numDrawn(0), groupEnergy(0), elapsedRead(0), numStepsRead(0), numRescuesRead(0), stepSizeRead(0),
+        areVelocitiesKept(false) {
 }
 
 bool DeviceSteps::canTake(const vector<ExpressionConstraint>& expressions) {
@@ -242,6 +243,8 @@ void DeviceSteps::compile(StepProgram::Update update) {
     resize(partials, (program->hasHalfSums() ? 2 : 1) * numSums * numPartials, mixedSize, "vrattlePartials");
     for (OpenMM::ComputeArray& array : trialPartials)
         resize(array, numSums * numPartials, mixedSize, "vrattleTrialPartials");
+    if (expressions)
+        resize(jumpPartials, numSums * numPartials, mixedSize, "vrattleJumpPartials");
     std::string key = program->getSource();
     for (const auto& define : program->getDefines())
         key += define.first + "=" + define.second + "\n";
@@ -266,8 +269,8 @@ void DeviceSteps::compile(StepProgram::Update update) {
             setLargeArguments(created);
         if (expressions) {
             created.expressions = expressions->create(
-                text, program->hasHalfSums(),
-                {settingsArray, partials, failure, oldPositions, oldVelocities, numGroups, numPartials});
+                text, program->hasHalfSums(), program->hasJumps(),
+                {settingsArray, partials, jumpPartials, failure, oldPositions, oldVelocities, numGroups, numPartials});
             addLastState(created.expressions.finish);
             addNoiseState(created.expressions.advance);
         }
@@ -487,17 +490,28 @@ void DeviceSteps::launchEvaluate(int step, Control::Change change, bool isReport
     numLaunches++;
 }
 
-bool DeviceSteps::setParameters(const vector<ExpressionConstraint>& given) {
-    OpenMM::ContextSelector selector(context);
-    return expressions && expressions->setParameters(given);
+void DeviceSteps::moveParameters(const vector<ExpressionConstraint>& given) {
+    if (expressions)
+        expressions->moveParameters(given);
 }
 
-bool DeviceSteps::begin(const State& state, double energy) {
+ExpressionParameters DeviceSteps::getParameters() {
+    OpenMM::ContextSelector selector(context);
+    return expressions ? expressions->getParameters(stepSizeRead) : ExpressionParameters();
+}
+
+vector<double> DeviceSteps::getExpressionMultipliers() {
+    OpenMM::ContextSelector selector(context);
+    return expressions->getMultipliers();
+}
+
+bool DeviceSteps::begin(const State& state, double energy, const ExpressionParameters* theta) {
     OpenMM::ContextSelector selector(context);
     vector<double> block(program->getControlSize(), 0.0);
     block[Control::Density] = state.density;
     block[Control::StepSize] = settings.stepSize / state.density;
     block[Control::DensityOffset] = state.densityOffset;
+    block[Control::DensityScale] = 1;
     block[Control::IsHalfKnown] = state.hasHalfStepValue;
     block[Control::HalfU] = state.halfStepValue;
     block[Control::MismatchSlope] = 1;
@@ -516,6 +530,9 @@ bool DeviceSteps::begin(const State& state, double energy) {
     noise.upload(vector<int>{(int) seed, (int) (seed >> 32), (int) numDrawn, (int) (numDrawn >> 32), stepNumber + 1});
     numStepsRead = numRescuesRead = 0;
     elapsedRead = 0;
+    stepSizeRead = block[Control::StepSize];
+    if (expressions && theta != nullptr)
+        expressions->setParameters(*theta, stepSizeRead);
     groupEnergy = energy;
     launchFinish(NO_STEP, 0, Control::AllChanged, false);
     launchEvaluate(NO_STEP, Control::NothingChanged, true);
@@ -556,10 +573,25 @@ void DeviceSteps::clearFailure() {
     failure.upload(vector<int>{0, 0});
 }
 
+// Parameters that move, or have moved and stop, come first.
+void DeviceSteps::beginExpressionStep() {
+    expressions->beginStep();
+    if (!expressions->areParametersMoving())
+        return;
+    expressions->launchMove(kernels.expressions, stepNumber, control[half]);
+    numLaunches++;
+    if (!kernels.expressions.judge)
+        return;
+    expressions->launchJudge(kernels.expressions, stepNumber, control[half], groupEnergy, isWide);
+    numLaunches++;
+}
+
 void DeviceSteps::advance(double maxStep) {
     OpenMM::ContextSelector selector(context);
     stepNumber++;
     areVelocitiesKept = false;
+    if (expressions)
+        beginExpressionStep();
     if (kernels.trial)
         for (int i = 0; i < numTrials; i++) {
             kernels.trial->setArg(0, stepNumber);
@@ -633,7 +665,7 @@ DeviceSteps::Report DeviceSteps::read() {
     const bool hasSums = code == Control::NotConverged || code == Control::UnsolvedDensity;
     if (code == Control::UnsolvedDensity)
         numTrials = MOST_TRIALS;
-    Report report = undo(stepsSinceFailure + 1, hasSums);
+    Report report = undo(stepsSinceFailure + 1, code, hasSums);
     report.hasFailed = true;
     return report;
 }
@@ -643,16 +675,19 @@ DeviceSteps::Report DeviceSteps::putBack() {
     vector<int> codes;
     failure.download(codes);
     if (codes[0] == 0)
-        return undo(1, true);
+        return undo(1, Control::NumCodes, true);
     const int code = codes[1] % Control::NumCodes;
-    Report report = undo(stepNumber - codes[0] + 1, code == Control::NotConverged || code == Control::UnsolvedDensity);
+    Report report =
+        undo(stepNumber - codes[0] + 1, code, code == Control::NotConverged || code == Control::UnsolvedDensity);
     report.hasFailed = true;
     return report;
 }
 
-// Put back the state before the last steps, of which the first is the one whose copy there is: the others have done nothing.
-DeviceSteps::Report DeviceSteps::undo(int numSteps, bool hasSums) {
-    kernels.restore->execute(context.getNumAtoms());
+// Put back the state before the last steps, of which the first is the one whose copy there is: the others have done nothing. Nor has one
+// that has found no density, which has left no copy either.
+DeviceSteps::Report DeviceSteps::undo(int numSteps, int code, bool hasSums) {
+    if (code != Control::UnsolvedDensity)
+        kernels.restore->execute(context.getNumAtoms());
     if (numSteps % 2 == 1)
         half = 1 - half;
     clearFailure();
@@ -693,6 +728,9 @@ DeviceSteps::Report DeviceSteps::fill(const vector<double>& block) {
     report.numSteps = (int) std::lround(block[Control::Steps] - numStepsRead);
     report.numRescues = (int) std::lround(block[Control::Rescues] - numRescuesRead);
     numDrawn += report.numSteps;
+    stepSizeRead = report.stepSize;
+    if (expressions)
+        expressions->endSteps(report.numSteps);
     report.state.reference = block[Control::Reference];
     report.state.isFollowed = block[Control::IsFollowed] != 0;
     report.state.seed = seed;

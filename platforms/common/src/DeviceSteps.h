@@ -80,17 +80,20 @@ public:
     /** The tolerance that is in force where another is asked for: rounding allows none below a certain one. */
     static double tolerableTolerance(const OpenMM::ComputeContext& context, double tolerance);
 
-    /** Take over the parameters of expressions, all that were given, after which begin() is due; returns whether they are others. */
-    bool setParameters(const std::vector<ExpressionConstraint>& given);
-
     /**
      * Take over a state: the positions and velocities that are on the device, where the forces have been computed. The velocities
      * are left as they are.
      *
      * @param groupEnergy    the energy of the monitor's force group there
+     * @param theta          the parameters of expressions, in the order in which these were given, with the rates of the last step; or null
+     *                       if there are none, or they are those that were given, and at rest
      * @return false if the constraints depend on each other or a monitor is no number
      */
-    bool begin(const State& state, double groupEnergy);
+    bool begin(const State& state, double groupEnergy, const ExpressionParameters* theta = nullptr);
+    /** The next step leads to these parameters of expressions, all that were given. The steps before it must have been read. */
+    void moveParameters(const std::vector<ExpressionConstraint>& given);
+    /** In that order the parameters of expressions in the state that was read last, with the rates of the step that has led there. */
+    ExpressionParameters getParameters();
     /**
      * Go on from positions, velocities and forces that are others now, or some of them: velocities are projected, the density is
      * scaled with u. With automatic step control it matters what the velocities were, see keepVelocities(). Does not wait for the
@@ -111,6 +114,8 @@ public:
     Report read();
     /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
     Report putBack();
+    /** Lambda(q[n],p[n]) of the expressions, all that were given, where the steps have led that were read last. Waits for the device. */
+    std::vector<double> getExpressionMultipliers();
     /** Whether a step has failed. Waits for the device. */
     bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
@@ -125,6 +130,10 @@ public:
     /** The clusters with expressions; there must be some. */
     const ExpressionClusters& getExpressionClusters() const {
         return expressions->getClusters();
+    }
+    /** How often parameters of expressions have been uploaded. */
+    long long getNumParameterUploads() const {
+        return expressions ? expressions->getNumUploads() : 0;
     }
     /** Launches since the beginning. */
     long long getNumLaunches() const {
@@ -163,7 +172,8 @@ private:
     void launchEvaluate(int step, Control::Change change, bool isReported);
     std::vector<double> readReport();
     void clearFailure();
-    Report undo(int numSteps, bool hasSums);
+    void beginExpressionStep();
+    Report undo(int numSteps, int code, bool hasSums);
     Report fill(const std::vector<double>& block);
     OpenMM::ComputeContext& context;
     std::unique_ptr<ExpressionSteps> expressions; // or null
@@ -183,9 +193,9 @@ private:
     int numTrials; // launches for a density
     int64_t seed, numDrawn; // by the steps that the host knows of
     double groupEnergy;
-    double elapsedRead, numStepsRead, numRescuesRead; // what the control block said when it was read last
+    double elapsedRead, numStepsRead, numRescuesRead, stepSizeRead; // what the control block said when it was read last
     OpenMM::ComputeArray atoms, lengths, multipliers, settingsArray, control[2], trials[2], partials, trialPartials[2],
-        reportArray;
+        jumpPartials, reportArray;
     OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts, noise;
     OpenMM::ComputeArray lastForces, lastSquares, lastVelocities; // of automatic step control
     bool areVelocitiesKept;

@@ -53,7 +53,7 @@ enum Header {
     HEADER_SIZE
 };
 
-const int DISTANCE = 0;
+const int DISTANCE = 0, NONE = -1;
 // What has more is not compiled anew in each of the five or so places from which it is called, and keeps its registers to itself.
 const size_t MANY_OPERATIONS = 2000;
 const char INLINE[] = "inline ";
@@ -68,12 +68,13 @@ int findRoot(vector<int>& parents, int i) {
 } // namespace
 
 struct ExpressionClusters::Row {
-    int kind, firstParameter;
+    int kind, firstParameter, expression; // the last is NONE for a distance
     vector<int> particles;
 };
 
 ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vector<ExpressionConstraint>& given) :
-        isMember(system.getNumParticles(), false), numConstraints(0), numLevels(0), numWork(0), numFactorEntries(0) {
+        isMember(system.getNumParticles(), false), numParameters(0), numConstraints(0), numLevels(0), numWork(0),
+        numFactorEntries(0) {
     if (given.empty())
         return;
     const vector<ExpressionConstraint> expressions = shareTexts(given);
@@ -95,18 +96,24 @@ ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vecto
         rows.push_back(row);
     };
     for (const ExpressionConstraint& constraint : expressions) {
+        const int expression = (int) firstParameters.size();
         firstParameters.push_back((int) parameters.size());
-        add({kindOf(constraint), (int) parameters.size(), constraint.particles});
+        add({kindOf(constraint), (int) parameters.size(), expression, constraint.particles});
+        for (size_t i = 0; i < given[expression].parameters.size(); i++) // numbers of the text come behind them
+            givenParameters.push_back((int) (parameters.size() + i));
         for (const auto& parameter : constraint.parameters)
             parameters.push_back(parameter.second);
     }
+    rowOfExpression.resize(expressions.size());
+    numParameters = (int) parameters.size();
+    parameters.resize(2 * numParameters, 0.0);
     for (int k = 0; k < system.getNumConstraints(); k++) {
         int i, j;
         double length;
         system.getConstraintParameters(k, i, j, length);
         if (masses[i] == 0 && masses[j] == 0)
             continue;
-        add({DISTANCE, (int) parameters.size(), {i, j}});
+        add({DISTANCE, (int) parameters.size(), NONE, {i, j}});
         parameters.push_back(length); // of no use to those that are in no such cluster
     }
     auto rootOf = [&](const Row& row) {
@@ -248,6 +255,8 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
         kindOfRow.push_back(row.kind);
         rowParameter.push_back(row.firstParameter);
         rowEntry.push_back((int) entryPlaces.size());
+        if (row.expression != NONE)
+            rowOfExpression[row.expression] = numConstraints + place;
         for (int i : row.particles) {
             if (masses[i] > 0)
                 entriesOf[placeOf[i]].push_back({(int) entryPlaces.size(), place});
@@ -338,24 +347,32 @@ string ExpressionClusters::writeFunctions() const {
         size += code.getSize();
     }
     auto choose = [&](const string& type, const string& name, const string& function, const string& parameterList,
-                      const string& arguments) {
+                      const string& arguments, const string& ofDistances = "") {
         text += "inline DEVICE " + type + " " + name + "(int kind, " + parameterList + ") {\n";
         const string call = type == "void" ? "" : "result = ";
         if (!call.empty())
             text += "    mixed result = 0;\n";
         for (size_t i = 0; i < kinds.size(); i++)
             text += string("    ") + (i == 0 ? "" : "else ") + "if (kind == " + std::to_string(i) + ")\n        " +
-                    call + function + "_E" + std::to_string(i) + "(" + arguments + ");\n";
+                    (i > 0 || ofDistances.empty() ? call + function + "_E" + std::to_string(i) + "(" + arguments + ")"
+                                                  : "result = " + ofDistances) +
+                    ";\n";
         text += (call.empty() ? string() : string("    return result;\n")) + "}\n\n";
     };
     const string x = "GLOBAL const mixed* x, ", v = "GLOBAL const mixed* v, ",
                  theta = "GLOBAL const int* at, GLOBAL const mixed* theta",
                  rates = ", GLOBAL const mixed* rates, mixed factor";
     choose("mixed", "findValue", "value", x + theta, "x, at, theta");
-    choose("mixed", "findMotion", "motion", x + theta + rates, "x, at, theta, rates, factor");
+    choose("mixed", "findMotion", "motion", x + theta + rates, "x, at, theta, rates, factor", "0");
     choose("mixed", "findCurvature", "curvature", x + v + theta, "x, v, at, theta");
-    choose("mixed", "findMovingCurvature", "movingCurvature", x + v + theta + rates, "x, v, at, theta, rates, factor");
+    choose("mixed", "findMovingCurvature", "movingCurvature", x + v + theta + rates, "x, v, at, theta, rates, factor",
+           "curvature_E0(x, v, at, theta)");
     choose("void", "findGradient", "gradient", x + theta + ", GLOBAL mixed* G", "x, at, theta, G");
+    text += "/** The number of its parameters that may move. */\ninline DEVICE int countMovable(int kind) {\n";
+    for (size_t i = 1; i < kinds.size(); i++)
+        text += "    if (kind == " + std::to_string(i) + ")\n        return " +
+                std::to_string(kinds[i]->parameters.size()) + ";\n";
+    text += "    return 0;\n}\n\n";
     if (size > MANY_OPERATIONS)
         for (size_t at = text.find(INLINE); at != string::npos; at = text.find(INLINE, at))
             text.replace(at, string(INLINE).size(), "__attribute__((noinline)) ");

@@ -52,14 +52,26 @@ public:
     const std::vector<int>& getPlaces() const {
         return places;
     }
-    /** The parameters of all rows: lengths, and those of expressions as they were given. */
+    /** Of all expressions; as many numbers follow, which are their changes in a step, and then the lengths of distances. */
+    int getNumParameters() const {
+        return numParameters;
+    }
+    /** The places among these of those that users know, in the order in which they were given; the others never move. */
+    const std::vector<int>& getGivenParameters() const {
+        return givenParameters;
+    }
+    /** All of these: parameters as they were given, and no changes. */
     const std::vector<double>& getParameters() const {
         return parameters;
     }
-    /** Write the parameters of an expression, by the number that it was given, into the parameters of all rows. */
+    /** Write the parameters of an expression, by the number that it was given, into those of all. */
     void writeParameters(int expression, const std::map<std::string, double>& values, std::vector<double>& all) const;
     int getNumConstraints() const {
         return numConstraints;
+    }
+    /** The row of each expression, in the order in which they were given, among those of all parts. */
+    const std::vector<int>& getRows() const {
+        return rowOfExpression;
     }
     /** Numbers that the parts work with. */
     size_t getNumWork() const {
@@ -84,9 +96,10 @@ private:
     static Kind nameKind(const ExpressionConstraint& constraint);
     std::map<Kind, int> numberOfKind;
     std::vector<int> parts, tables, places;
-    std::vector<int> firstParameters; // of each expression
+    std::vector<int> firstParameters, rowOfExpression; // of each expression
+    std::vector<int> givenParameters;
     std::vector<double> parameters;
-    int numConstraints, numLevels;
+    int numParameters, numConstraints, numLevels;
     size_t numWork, numFactorEntries;
 };
 

@@ -11,11 +11,16 @@ using OpenMM::ComputeKernel;
 using OpenMM::Vec3;
 using std::vector;
 
+// Of each kernel that has EXPRESSION_PARAMETERS, at the end.
+static const int NUM_PART_ARGUMENTS = 19;
+
 ExpressionSteps::ExpressionSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
                                  const vector<ExpressionConstraint>& expressions) :
         context(context), clusters(system, expressions), isMixed(false),
         numThreads(context.getIsCPU() ? 1 : StepProgram::getGroupSize(true)), cells(3 * clusters.getPlaces().size(), 0),
-        values(clusters.getParameters()) {
+        place{0, false}, from(0), wereMoving(false), endedPlace(place), numBegun(0), hasMoved(false), numUploads(0) {
+    const vector<double>& all = clusters.getParameters();
+    values = target = vector<double>(all.begin(), all.begin() + clusters.getNumParameters());
 }
 
 void ExpressionSteps::initialize(bool isMixedPrecision) {
@@ -35,14 +40,16 @@ void ExpressionSteps::initialize(bool isMixedPrecision) {
     clear(shifts, cells.size(), mixedSize, "vrattleShifts");
     clear(multipliers, clusters.getNumConstraints(), mixedSize, "vrattlePartMultipliers");
     clear(iterations, getNumParts(), 4, "vrattlePartIterations");
-    for (ComputeArray& array : parameters)
+    for (ComputeArray& array : parameters) {
         clear(array, clusters.getParameters().size(), mixedSize, "vrattleParameters");
-    clear(changes, clusters.getParameters().size(), mixedSize, "vrattleParameterChanges");
-    if (!values.empty())
-        parameters[0].upload(values, true);
+        if (!clusters.getParameters().empty())
+            array.upload(clusters.getParameters(), true);
+    }
+    clear(jumpRates, clusters.getNumParameters(), mixedSize, "vrattleJumpRates");
+    clear(hasJumped, 1, 4, "vrattleHasJumped");
 }
 
-ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program, bool hasHalfSums,
+ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program, bool hasHalfSums, bool hasJumps,
                                                  const Arrays& arrays) {
     // The arguments in the order of kernels/expression.cc; empty ones change from launch to launch.
     auto addEmpty = [](ComputeKernel& kernel, int count) {
@@ -67,6 +74,26 @@ ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program,
     kernels.advance->addArg(arrays.oldPositions);
     kernels.advance->addArg(arrays.oldVelocities);
     addParts(kernels.advance, arrays);
+    kernels.move = program->createKernel("moveExpressions");
+    addEmpty(kernels.move, 3); // step, wereMoving, control
+    kernels.move->addArg(arrays.settings);
+    kernels.move->addArg(arrays.partials);
+    kernels.move->addArg(arrays.jumpPartials);
+    kernels.move->addArg(jumpRates);
+    kernels.move->addArg(hasJumped);
+    addEmpty(kernels.move, 1); // changedParameters
+    addParts(kernels.move, arrays);
+    if (!hasJumps)
+        return kernels;
+    kernels.judge = program->createKernel("judgeJump");
+    addEmpty(kernels.judge, 2); // step, groupEnergy
+    kernels.judge->addArg(arrays.numPartials);
+    addEmpty(kernels.judge, 1); // control
+    kernels.judge->addArg(arrays.settings);
+    kernels.judge->addArg(arrays.partials);
+    kernels.judge->addArg(arrays.jumpPartials);
+    kernels.judge->addArg(hasJumped);
+    kernels.judge->addArg(arrays.failure);
     return kernels;
 }
 
@@ -82,10 +109,18 @@ void ExpressionSteps::addParts(ComputeKernel& kernel, const Arrays& arrays) {
     kernel->addArg(arrays.failure);
     for (ComputeArray* array : {&parts, &tables, &work, &shifts, &multipliers, &iterations})
         kernel->addArg(*array);
-    kernel->addArg(parameters[0]);
-    kernel->addArg(parameters[0]);
-    kernel->addArg(changes);
-    kernel->addArg(0); // areParametersMoving
+    for (int i = 0; i < 2; i++)
+        kernel->addArg(); // the parameters at the beginning of the step and at its end
+    kernel->addArg(clusters.getNumParameters());
+    kernel->addArg(); // areParametersMoving
+}
+
+// What addParts() has left empty.
+void ExpressionSteps::setPlaces(ComputeKernel& kernel, int numOwnArguments, int from) {
+    const int first = numOwnArguments + NUM_PART_ARGUMENTS - 4;
+    kernel->setArg(first, parameters[from]);
+    kernel->setArg(first + 1, parameters[place.side]);
+    kernel->setArg(first + 3, (int) place.isMoving);
 }
 
 // The type must be that of the kernel's parameter.
@@ -100,17 +135,87 @@ void ExpressionSteps::launch(ComputeKernel& kernel) {
     kernel->execute(std::min(getNumParts(), context.getNumThreadBlocks()) * numThreads, numThreads);
 }
 
-bool ExpressionSteps::setParameters(const vector<ExpressionConstraint>& expressions) {
-    vector<double> next = values;
-    for (size_t i = 0; i < expressions.size(); i++)
-        clusters.writeParameters((int) i, expressions[i].parameters, next);
-    if (next == values)
-        return false;
-    values.swap(next);
-    if (parameters[0].isInitialized()) // else it comes
-        parameters[0].upload(values, true);
-    return true;
+// ------------------------------------------------------------------------------------------------------------- parameters
+
+// Values and changes are all that changes from step to step.
+void ExpressionSteps::uploadParameters(const vector<double>& changes) {
+    vector<double> data = values;
+    data.insert(data.end(), changes.begin(), changes.end());
+    if (data.empty())
+        return;
+    ComputeArray& array = parameters[place.side];
+    if (isMixed)
+        array.uploadSubArray(data.data(), 0, (int) data.size());
+    else
+        array.uploadSubArray(vector<float>(data.begin(), data.end()).data(), 0, (int) data.size());
+    numUploads++;
 }
+
+void ExpressionSteps::setParameters(const ExpressionParameters& theta, double stepSize) {
+    vector<double> changes(values.size(), 0.0);
+    const vector<int>& given = clusters.getGivenParameters();
+    for (size_t k = 0; k < given.size(); k++) {
+        values[given[k]] = theta.values[k];
+        changes[given[k]] = theta.rates[k] * stepSize;
+    }
+    target = values;
+    place.isMoving = theta.isMoving;
+    from = place.side;
+    numBegun = 0;
+    hasMoved = false;
+    uploadParameters(changes);
+}
+
+void ExpressionSteps::moveParameters(const vector<ExpressionConstraint>& expressions) {
+    for (size_t i = 0; i < expressions.size(); i++)
+        clusters.writeParameters((int) i, expressions[i].parameters, target);
+}
+
+void ExpressionSteps::beginStep() {
+    if (numBegun++ == 0)
+        endedPlace = place;
+    wereMoving = place.isMoving;
+    from = place.side;
+    place.isMoving = target != values;
+    if (!place.isMoving)
+        return;
+    vector<double> changes(values.size());
+    for (size_t k = 0; k < values.size(); k++)
+        changes[k] = target[k] - values[k];
+    endedValues = values;
+    values = target;
+    hasMoved = true;
+    place.side = 1 - from; // what was before stays, for the sake of a step that fails
+    uploadParameters(changes);
+}
+
+void ExpressionSteps::endSteps(int numCompleted) {
+    if (numCompleted < numBegun) {
+        const bool areBefore = numCompleted == 0;
+        place.isMoving = areBefore ? endedPlace.isMoving : numCompleted == 1 && hasMoved;
+        if (areBefore && hasMoved) {
+            place.side = endedPlace.side;
+            values = endedValues;
+        }
+    }
+    numBegun = 0;
+    hasMoved = false;
+}
+
+ExpressionParameters ExpressionSteps::getParameters(double stepSize) {
+    vector<double> all;
+    if (place.isMoving)
+        parameters[place.side].download(all, true);
+    ExpressionParameters theta;
+    theta.isMoving = place.isMoving;
+    for (int k : clusters.getGivenParameters()) {
+        theta.values.push_back(values[k]);
+        theta.rates.push_back(place.isMoving ? all[values.size() + k] / stepSize : 0.0);
+    }
+    return theta;
+}
+
+// ------------------------------------------------------------------------------------------------------------------ launches
 
 // OpenMM moves whole molecules by box vectors, and back where a barostat's move is rejected.
 void ExpressionSteps::updateShifts() {
@@ -142,6 +247,7 @@ void ExpressionSteps::launchFinish(Kernels& kernels, int step, double kick, int 
     kernels.finish->setArg(2, change);
     kernels.finish->setArg(3, (int) isStored);
     kernels.finish->setArg(4, control);
+    setPlaces(kernels.finish, 7, place.side);
     launch(kernels.finish);
 }
 
@@ -152,6 +258,7 @@ void ExpressionSteps::launchTrial(Kernels& kernels, int step, double tolerance, 
     setMixed(kernels.trial, 1, tolerance);
     kernels.trial->setArg(3, nextTrial);
     kernels.trial->setArg(4, nextPartials);
+    setPlaces(kernels.trial, 5, from);
     launch(kernels.trial);
 }
 
@@ -160,7 +267,36 @@ void ExpressionSteps::launchAdvance(Kernels& kernels, int step, double tolerance
     kernels.advance->setArg(0, step);
     setMixed(kernels.advance, 1, tolerance);
     kernels.advance->setArg(2, nextControl);
+    setPlaces(kernels.advance, 5, from);
     launch(kernels.advance);
+}
+
+void ExpressionSteps::launchMove(Kernels& kernels, int step, ComputeArray& control) {
+    updateShifts();
+    kernels.move->setArg(0, step);
+    kernels.move->setArg(1, (int) wereMoving);
+    kernels.move->setArg(2, control);
+    kernels.move->setArg(8, parameters[place.side]);
+    setPlaces(kernels.move, 9, from);
+    launch(kernels.move);
+}
+
+void ExpressionSteps::launchJudge(Kernels& kernels, int step, ComputeArray& control, double groupEnergy, bool isWide) {
+    kernels.judge->setArg(0, step);
+    if (isWide)
+        kernels.judge->setArg(1, groupEnergy);
+    else
+        kernels.judge->setArg(1, (float) groupEnergy);
+    kernels.judge->setArg(3, control);
+    kernels.judge->execute(StepProgram::getGroupSize(true), StepProgram::getGroupSize(true));
+}
+
+vector<double> ExpressionSteps::getMultipliers() {
+    vector<double> all, result;
+    multipliers.download(all, true);
+    for (int row : clusters.getRows())
+        result.push_back(all[row]);
+    return result;
 }
 
 vector<int> ExpressionSteps::getNumIterations() {

@@ -5,7 +5,9 @@
 #include "ClusterAlgebra.h"
 #include "DeviceSources.h"
 #include "constraints/ConstraintMatrix.h"
+#include "constraints/ParameterMotion.h"
 #include "step/LangevinDynamics.h"
+#include "step/MonitorControl.h"
 #include <algorithm>
 #include <cmath>
 #include <sstream>
@@ -191,6 +193,7 @@ StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& 
                                       {"HALF_U", Control::HalfU},
                                       {"IS_HALF_KNOWN", Control::IsHalfKnown},
                                       {"DENSITY_OFFSET", Control::DensityOffset},
+                                      {"DENSITY_SCALE", Control::DensityScale},
                                       {"MISMATCH_SLOPE", Control::MismatchSlope},
                                       {"IS_SHORTENED", Control::IsShortened},
                                       {"MOST_TRIALS", Control::MostTrials},
@@ -462,11 +465,13 @@ void StepProgram::writeAutomaticControl(int numPieces) {
 
 void StepProgram::writeExpressions(const ExpressionClusters& expressions) {
     string& text = words["EXPRESSION_CLUSTERS"];
-    text = DeviceSources::expression;
+    text = DeviceSources::expression + DeviceSources::moving;
     replaceAll(text, "EXPRESSION_FUNCTIONS", expressions.writeFunctions());
     defines["EXPRESSION_LENGTH"] = literal(ConstraintSystem::EXPRESSION_LENGTH);
     defines["MAX_CHORD_ITERATIONS"] = to_string(MAX_CHORD_ITERATIONS);
     defines["SMALLEST_SHARE"] = "1e-4f";
     defines["PART_TERMS"] = to_string(ExpressionClusters::NUM_TERMS);
     defines["MAX_PART_ITERATIONS"] = to_string(MAX_PART_ITERATIONS);
+    defines["SUDDEN_CHANGE"] = to_string(ParameterMotion::SUDDEN_CHANGE) + "f";
+    defines["SMALL_JUMP"] = to_string(MonitorControl::SMALL_JUMP) + "f";
 }

@@ -30,6 +30,7 @@ enum Field {
     HalfU,         // u(q[n],p[n-1/2]), where IsHalfKnown says so; else it is in the sums
     IsHalfKnown,
     DensityOffset, // what (3.14) and (3.15) differed by in the last step
+    DensityScale,  // by which u and rho change where parameters of expressions begin to move, or stop; else 1
     MismatchSlope, // of (3.14) as a function of the density, in the last step
     IsShortened,   // the last step was cut short
     MostTrials,    // of a density, since the host has looked last
@@ -130,6 +131,10 @@ public:
     }
     bool hasHalfSums() const {
         return update == SemiExplicit;
+    }
+    /** Whether the density follows monitors that others may be scaled with. */
+    bool hasJumps() const {
+        return update == Sum || update == Bounded || update == SemiExplicit;
     }
     /** Words of the control block and of the settings. */
     int getControlSize() const {

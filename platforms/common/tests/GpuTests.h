@@ -7,6 +7,7 @@
 #include "ReferenceVRattleKernelFactory.h"
 #include "TestSupport.h"
 #include "openmm/Platform.h"
+#include <cctype>
 
 namespace OpenMMVRattle {
 
@@ -17,6 +18,15 @@ inline std::string& testPlatformName() {
 
 inline OpenMM::Platform& getTestPlatform() {
     return OpenMM::Platform::getPlatform(testPlatformName());
+}
+
+/** A message, whose numbers may differ by rounding. */
+inline std::string withoutNumbers(const std::string& text) {
+    std::string result;
+    for (char c : text)
+        if (!std::isdigit(c) && c != '.' && c != '-' && c != '+' && c != 'e')
+            result += c;
+    return result;
 }
 
 inline int runOnPlatform(const TestList& tests, int argc, char** argv) {

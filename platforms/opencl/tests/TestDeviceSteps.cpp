@@ -168,12 +168,43 @@ struct Both {
     Context context;
     VRattleRun dynamics;
     DeviceSteps device;
+    vector<ExpressionConstraint> expressions; // with the parameters that the next step leads to
     StepSettings settings;
 
     Both(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
             dynamics(molecules.masses, molecules.constraints, molecules.expressions),
-            device(lender.getDevice(), molecules.system, molecules.expressions), settings() {
+            device(lender.getDevice(), molecules.system, molecules.expressions), expressions(molecules.expressions),
+            settings() {
+    }
+    void move(int expression, const std::string& name, double change) {
+        std::map<std::string, double>& parameters = expressions[expression].parameters;
+        parameters.at(name) += change;
+        dynamics.setParameters(expression, parameters);
+        device.moveParameters(expressions);
+    }
+    ExpressionParameters getHostParameters() const {
+        return dynamics.getConstraintSystem().toGivenOrder(dynamics.getParameters());
+    }
+    // theta[n], its rates, and the multipliers of expressions.
+    void requireParametersToAgree(double fraction) {
+        const ExpressionParameters expected = getHostParameters(), found = device.getParameters();
+        ASSERT_EQUAL(expected.isMoving, found.isMoving);
+        ASSERT(expected.values == found.values);
+        vector<double> multipliers;
+        dynamics.getConstraintSystem().getGivenMultipliers(dynamics.getMultipliers(), multipliers);
+        multipliers.erase(multipliers.begin(), multipliers.end() - expressions.size());
+        const std::pair<vector<double>, vector<double>> pairs[] = {{expected.rates, found.rates},
+                                                                   {multipliers, device.getExpressionMultipliers()}};
+        for (const auto& pair : pairs) {
+            double largest = 0;
+            ASSERT_EQUAL(pair.first.size(), pair.second.size());
+            for (double value : pair.first)
+                largest = std::max(largest, std::fabs(value));
+            for (size_t k = 0; k < pair.first.size(); k++)
+                requireAtMost(fraction * largest, std::fabs(pair.first[k] - pair.second[k]),
+                              "rates or multipliers " + std::to_string(k));
+        }
     }
     // Some steps on the host, then the state goes to the device.
     void start(const Molecules& molecules, StepDensity::Update update, const vector<StepMonitor::Term>& terms) {
@@ -224,7 +255,9 @@ struct Both {
         device.setSettings({settings.stepSize,
                             StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
                             settings.update, false, settings.tolerance, terms});
-        ASSERT(device.begin({memory.rho, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue}, energy));
+        const ExpressionParameters theta = getHostParameters();
+        ASSERT(device.begin({memory.rho, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue}, energy,
+                            &theta));
     }
     // To be asked for before the forces, which it overwrites.
     double groupEnergy() {
@@ -267,8 +300,8 @@ struct Both {
     void requireAgreement(const DeviceSteps::Report& report, double distance, double speed, double fraction) {
         ASSERT(!report.hasFailed);
         ASSERT_EQUAL(0, report.numRescues);
-        ASSERT(largestDifference(positions(), dynamics.getPositions()) <= distance);
-        ASSERT(largestDifference(velocities(), dynamics.getVelocities()) <= speed);
+        requireAtMost(distance, largestDifference(positions(), dynamics.getPositions()), "positions");
+        requireAtMost(speed, largestDifference(velocities(), dynamics.getVelocities()), "velocities");
         ASSERT_EQUAL(dynamics.getMonitorValues().size(), report.values.size());
         for (size_t k = 0; k < report.values.size(); k++)
             ASSERT_EQUAL_TOL(dynamics.getMonitorValues()[k], report.values[k], fraction);
@@ -571,6 +604,106 @@ void testDivisionOfExpressions() {
     const ExpressionClusters many(pendulums, spheres);
     ASSERT_EQUAL(8, many.getParts().size());
     ASSERT_EQUAL(1, many.getNumLevels());
+}
+
+// Parameters that begin to move, go on, turn back and stop, some of them, with steps that are cut short and several at once; and an angle
+// that is set back by a full turn.
+void testMovingParameters(const std::string& precision, const vector<StepDensity::Update>& updates, double distance,
+                          double fraction) {
+    Molecules molecules = makeExpressions();
+    const int turning = (int) molecules.masses.size(), turn = (int) molecules.expressions.size();
+    molecules.addParticle(3, Vec3(-0.4, 0.1, 0.2));
+    molecules.field->addParticle(turning);
+    molecules.expressions.push_back({"atan2(y1*cos(angle)-x1*sin(angle), x1*cos(angle)+y1*sin(angle))",
+                                     {turning},
+                                     {{"angle", std::atan2(0.1, -0.4)}}});
+    Both both(molecules, precision);
+    for (StepDensity::Update update : updates) {
+        both.expressions = molecules.expressions;
+        for (int i = 0; i <= turn; i++)
+            both.dynamics.setParameters(i, both.expressions[i].parameters);
+        both.dynamics.adoptParameters();
+        both.start(molecules, update,
+                   {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}, {StepMonitor::VectorField, 0.5, 0.7, 0.0}});
+        const long long uploads = both.device.getNumParameterUploads();
+        int numMoves = 0;
+        const auto moveAll = [&](double by) {
+            for (int i = 0; i < turn; i++)
+                if (i % 3 != 2 && i != 4) // whose gradient is small
+                    both.move(i, "held", by * (1 + 0.1 * (i % 5)));
+            both.move(turn, "angle", 10 * by);
+            numMoves++;
+        };
+        const auto step = [&](int count, double maxStep, double growth) {
+            try {
+                both.requireStepsToAgree(count, maxStep, growth * distance, growth * fraction);
+                both.requireParametersToAgree(100 * growth * fraction);
+                ASSERT_EQUAL(0, both.dynamics.getNumRescues()); // which has no secant for (3.14), and gives up first
+            }
+            catch (const std::exception& e) {
+                throw OpenMM::OpenMMException("update " + std::to_string(update) + ", after " +
+                                              std::to_string(numMoves) + " moves: " + e.what());
+            }
+        };
+        moveAll(8.5e-4);
+        step(1, NO_LIMIT, 1);
+        for (int i = 0; i < 5; i++) {
+            moveAll(8.5e-4 + 1e-5 * i);
+            const long long before = both.device.getNumLaunches();
+            step(1, NO_LIMIT, 10);
+            const int numTrials = update == StepDensity::SemiExplicit ? 3 : 0; // at least
+            ASSERT(both.device.getNumLaunches() - before >= 2 + 4 + 2 * numTrials + 1);
+            ASSERT(both.device.getNumLaunches() - before <= 2 + 4 + 4 * numTrials + 1);
+        }
+        moveAll(8.5e-4);
+        both.move(turn, "angle", 8 * std::atan(1.0));
+        step(1, NO_LIMIT, 10);
+        moveAll(-3e-4);
+        step(3, 0.0002, 100); // of which the first moves, and the last is cut short
+        step(1, NO_LIMIT, 100);
+        moveAll(2e-4);
+        step(1, 0.0003, 100); // after which the rates are those of another step size
+        moveAll(2e-4);
+        step(1, NO_LIMIT, 100);
+        // Not all at once: what stops and what goes on.
+        both.move(0, "held", 3e-4);
+        numMoves++;
+        step(1, NO_LIMIT, 100);
+        ASSERT_EQUAL(numMoves, both.device.getNumParameterUploads() - uploads);
+        // A jump that no step can make leaves nothing behind, nor do the steps after it.
+        const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+        both.move(0, "held", -5);
+        for (int i = 0; i < 3; i++)
+            both.stepOnDevice();
+        const DeviceSteps::Report report = both.device.read();
+        ASSERT(report.hasFailed);
+        ASSERT_EQUAL(0, report.numSteps);
+        ASSERT(both.positions() == positions);
+        ASSERT(both.velocities() == velocities);
+        ASSERT(both.device.getParameters().values == both.getHostParameters().values);
+        ASSERT(both.device.getParameters().isMoving);
+        both.expressions[0].parameters["held"] += 5;
+        both.dynamics.setParameters(0, both.expressions[0].parameters);
+        both.handOver();
+        moveAll(2e-4);
+        step(2, NO_LIMIT, 1000);
+        // Where a later one fails the first has moved.
+        moveAll(2e-4);
+        both.stepOnDevice();
+        both.context.setParameter("strength", 1e8); // of forces that are no numbers
+        both.stepOnDevice();
+        both.context.setParameter("strength", 1);
+        both.stepOnDevice();
+        const DeviceSteps::Report second = both.device.read();
+        ASSERT(second.hasFailed);
+        ASSERT_EQUAL(1, second.numSteps);
+        both.computeForces();
+        const vector<Vec3> after = both.positions();
+        both.stepOnHost();
+        ASSERT(largestDifference(after, both.dynamics.getPositions()) <= 1000 * distance);
+        ASSERT(both.device.getParameters().values == both.getHostParameters().values);
+        ASSERT(both.device.getParameters().isMoving);
+    }
 }
 
 // A long chain that is nearly straight moves across itself: there the chord iteration does not contract. In a cluster with an expression
@@ -1184,6 +1317,9 @@ int main(int argc, char** argv) {
         {"expressions agree, mixed",
          [] { testStepsAgree(makeExpressions(), "mixed", {StepDensity::Explicit}, 1e-9, 1e-6); }},
         {"division and launches of expressions", testDivisionOfExpressions},
+        {"moving parameters, double",
+         [] { testMovingParameters("double", {StepDensity::SemiExplicit, StepDensity::Explicit}, 1e-12, 1e-9); }},
+        {"moving parameters, mixed", [] { testMovingParameters("mixed", {StepDensity::Explicit}, 1e-9, 1e-6); }},
         {"Newton's iteration with expressions", testNewton},
         {"changed velocities", testChangedVelocities},
         {"automatic step control, double", [] { testAutomaticControl(Molecules(2), "double", 1e-12, 1e-9); }},

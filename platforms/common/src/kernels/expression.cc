@@ -24,7 +24,7 @@ typedef struct {
     GLOBAL mixed *newtonPivots, *newtonLower, *newtonUpper;
 } Part;
 
-/** The parameters of all rows at the positions of G and at those to come, and their change on the way there. */
+/** The parameters of all rows at the positions of G and at those to come, and the change of those that may change on the way there. */
 typedef struct {
     GLOBAL const mixed *here, *next, *changes;
     int areMoving;
@@ -33,11 +33,11 @@ typedef struct {
 #define EXPRESSION_PARAMETERS int numParts, int firstPartial, int numPartials, int paddedNumAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, \
         GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, GLOBAL int* RESTRICT failure, GLOBAL const int* RESTRICT parts, GLOBAL const int* RESTRICT partTables, \
         GLOBAL mixed* partWork, GLOBAL const mixed* RESTRICT partShifts, GLOBAL mixed* partMultipliers, GLOBAL int* RESTRICT partIterations, \
-        GLOBAL const mixed* parametersHere, GLOBAL const mixed* nextParameters, GLOBAL const mixed* parameterChanges, int areParametersMoving
+        GLOBAL const mixed* parametersHere, GLOBAL const mixed* nextParameters, int numParameters, int areParametersMoving
 #define EXPRESSION_STATE_PARAMETERS int paddedNumAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force
 #define EXPRESSION_STATE_ARGUMENTS paddedNumAtoms, posq, posqCorrection, velm, force
 #define OPEN_PART openPart(partTables + parts[i], partWork, partShifts, partMultipliers)
-#define OPEN_PARAMETERS Parameters theta; theta.here = parametersHere; theta.next = nextParameters; theta.changes = parameterChanges; theta.areMoving = areParametersMoving;
+#define OPEN_PARAMETERS Parameters theta; theta.here = parametersHere; theta.next = nextParameters; theta.changes = nextParameters + numParameters; theta.areMoving = areParametersMoving;
 
 inline DEVICE Part openPart(GLOBAL const int* table, GLOBAL mixed* work, GLOBAL const mixed* shifts, GLOBAL mixed* multipliers) {
     Part part;

@@ -184,12 +184,13 @@ inline DEVICE wide boundedUpdate(wide u, wide rho, wide a) {
 
 /** The density of the next step where it follows from what is known on the step: the updates Explicit (3.15) and Bounded. */
 inline DEVICE wide nextDensity(wide u, const wide* now, GLOBAL const wide* RESTRICT settings) {
+    const wide scale = now[DENSITY_SCALE];
 #if UPDATE == FIXED || UPDATE == LANGEVIN
     return 1;
 #elif UPDATE == BOUNDED
-    return boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
+    return boundedUpdate(scale*u, scale*now[DENSITY], settings[SMALLEST]);
 #else
-    return 2*u - now[DENSITY];
+    return scale*(2*u - now[DENSITY]);
 #endif
 }
 
@@ -199,7 +200,8 @@ inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL c
     const bool isShortened = (full > maxStep || fabs(full - maxStep) <= (wide) SLIVER*full);
     now[STEP_SIZE] = (isShortened ? maxStep : full);
     now[DENSITY] = (isShortened ? previous + (rho - previous)*min((wide) 1, maxStep/full) : rho);
-    now[DENSITY_OFFSET] = (isShortened ? now[DENSITY_OFFSET] : rho - (2*u - previous));
+    now[DENSITY_OFFSET] = (isShortened ? now[DENSITY_OFFSET] : rho - now[DENSITY_SCALE]*(2*u - previous));
+    now[DENSITY_SCALE] = 1;
     now[IS_SHORTENED] = (isShortened ? 1 : 0);
     now[IS_HALF_KNOWN] = 0;
 #if UPDATE == AUTOMATIC
@@ -463,11 +465,11 @@ KERNEL void tryStep(int step, int index, wide groupEnergy, mixed tolerance, int 
         for (int i = 0; i < TRIAL_SIZE; i++)
             trial[i] = (index == 0 ? (wide) 0 : lastTrial[i]);
         if (index == 0) {
-            const wide u = evaluateMonitors(sums, groupEnergy, settings, values);
+            const wide u = evaluateMonitors(sums, groupEnergy, settings, values), scale = control[DENSITY_SCALE];
             trial[TRIAL_U] = u;
-            trial[TRIAL_PREVIOUS] = control[DENSITY];
-            trial[TRIAL_HALF_U] = (control[IS_HALF_KNOWN] != 0 ? control[HALF_U] : evaluateMonitors(halfSums, groupEnergy, settings, values));
-            trial[TRIAL_DENSITY] = 2*u - control[DENSITY] + control[DENSITY_OFFSET];
+            trial[TRIAL_PREVIOUS] = scale*control[DENSITY];
+            trial[TRIAL_HALF_U] = scale*(control[IS_HALF_KNOWN] != 0 ? control[HALF_U] : evaluateMonitors(halfSums, groupEnergy, settings, values));
+            trial[TRIAL_DENSITY] = scale*(2*u - control[DENSITY]) + control[DENSITY_OFFSET];
             trial[TRIAL_SLOPE] = control[MISMATCH_SLOPE];
             trial[TRIAL_STATUS] = (u >= 0 && trial[TRIAL_HALF_U] >= 0 && trial[TRIAL_DENSITY] > 0 ? TRYING : UNSOLVED);
         }
@@ -555,7 +557,7 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
 #elif UPDATE == SUM || UPDATE == SEMI_EXPLICIT
         // A rescue: the sum gave no step, or one far above the maximum.
         if (!(rho > 0) || rho < settings[SMALLEST]/2) {
-            rho = boundedUpdate(u, now[DENSITY], settings[SMALLEST]);
+            rho = boundedUpdate(now[DENSITY_SCALE]*u, now[DENSITY_SCALE]*now[DENSITY], settings[SMALLEST]);
             now[RESCUES] += 1;
         }
 #endif

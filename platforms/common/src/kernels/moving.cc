@@ -1,0 +1,100 @@
+// OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
+// SPDX-License-Identifier: MIT
+
+// Parameters of expressions that move (docs/method.md, section 9): what comes before a step in which they do, or in which they stop.
+
+#define HAS_JUMPS (UPDATE == SUM || UPDATE == BOUNDED || UPDATE == SEMI_EXPLICIT)
+
+/**
+ * How far parameters move: what is left of a change by whole periods of g. Where a rate changes suddenly the velocities along the
+ * constraints jump in the step that comes, and the monitors with them; the sums of these are left for judgeJump().
+ */
+KERNEL void moveExpressions(int step, int wereMoving, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials,
+        GLOBAL mixed* RESTRICT jumpPartials, GLOBAL mixed* RESTRICT jumpRates, GLOBAL int* RESTRICT hasJumped, GLOBAL mixed* changedParameters, EXPRESSION_PARAMETERS) {
+    EXPRESSION_MEMORY
+    OPEN_PARAMETERS
+    const bool isFrozen = IS_FROZEN(failure, step);
+    GLOBAL mixed* changes = changedParameters + numParameters;
+    GLOBAL const mixed* lastChanges = parametersHere + numParameters;
+    // At the rate of a step of the density that there is.
+    const mixed lastRate = (mixed) (1/control[STEP_SIZE]), rate = (mixed) (control[DENSITY]/settings[NOMINAL]);
+    mixed sums[NUM_SUMS];
+    KEEP_LOOP for (int i = (isFrozen ? numParts : GROUP_ID); i < numParts; i += NUM_GROUPS) {
+        const Part part = OPEN_PART;
+        loadPart(&part, 1, 0, EXPRESSION_STATE_ARGUMENTS);
+        bool isSudden = false;
+        KEEP_LOOP for (int j = THREAD; j < part.numRows; j += NUM_THREADS) {
+            const int k = part.order[j], kind = part.kinds[k], first = part.rowParameter[k];
+            const int end = first + countMovable(kind);
+            GLOBAL const int* at = part.places + part.rowEntry[k];
+            if (theta.areMoving && end > first) {
+                const mixed change = findValue(kind, part.position, at, theta.next + first) - findValue(kind, part.position, at, theta.here + first);
+                const mixed linear = findMotion(kind, part.position, at, theta.here + first, theta.changes + first, 1);
+                if (linear != 0 && change/linear < (mixed) 0.5f) // which no curvature of g makes of a small change
+                    KEEP_LOOP for (int p = first; p < end; p++)
+                        changes[p] *= change/linear;
+            }
+#if HAS_JUMPS
+            KEEP_LOOP for (int p = first; p < end; p++) {
+                const mixed before = (wereMoving ? lastRate*lastChanges[p] : (mixed) 0), after = (theta.areMoving ? rate*changes[p] : (mixed) 0);
+                const bool isJump = (fabs(after - before) > (mixed) SUDDEN_CHANGE*max(fabs(after), fabs(before)));
+                jumpRates[p] = (isJump ? after : before);
+                isSudden = isSudden || isJump;
+            }
+#endif
+        }
+#if HAS_JUMPS
+        if (isSudden)
+            hasJumped[0] = 1;
+        SYNC_PIECE;
+        findRows(&part, part.position, theta.here, part.G);
+        KEEP_LOOP for (int j = THREAD; j < part.numRows; j += NUM_THREADS) {
+            const int k = part.order[j], first = part.rowParameter[k];
+            part.solution[k] = multiplyRow(&part, k, part.base) +
+                    findMotion(part.kinds[k], part.position, part.places + part.rowEntry[k], theta.here + first, jumpRates + first, 1);
+        }
+        SYNC_PIECE;
+        solveWithFactor(&part, part.pivots, part.lower, part.lower, part.solution);
+        pushParticles(&part, part.solution, -1, part.base, part.moved);
+        for (int j = 0; j < NUM_SUMS; j++)
+            sums[j] = 0;
+        Parameters jump = theta;
+        jump.changes = jumpRates;
+        jump.areMoving = 1;
+        measurePart(&part, part.moved, &jump, theta.here, 1, force, paddedNumAtoms, sums);
+        MERGE_SUMS(sums);
+        if (THREAD == 0)
+            for (int j = 0; j < NUM_SUMS; j++)
+                jumpPartials[j*numPartials + firstPartial + i] = sums[j];
+#endif
+        SYNC_PIECE;
+    }
+#if HAS_JUMPS
+    // All others stay as they are.
+    KEEP_LOOP for (int i = (GROUP_ID == 0 ? THREAD : numPartials); i < numPartials; i += NUM_THREADS)
+        if (i < firstPartial || i >= firstPartial + numParts)
+            for (int j = 0; j < NUM_SUMS; j++)
+                jumpPartials[j*numPartials + i] = partials[j*numPartials + i];
+#endif
+}
+
+#if HAS_JUMPS
+
+/** By how much u, and the density with it, changes in such a jump; of one work group. */
+KERNEL void judgeJump(int step, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials,
+        GLOBAL const mixed* RESTRICT jumpPartials, GLOBAL int* RESTRICT hasJumped, GLOBAL const int* RESTRICT failure) {
+    LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
+    mixed sums[NUM_SUMS], jumpSums[NUM_SUMS];
+    wide values[NUM_VALUES];
+    gatherSums(numPartials, partials, sums, buffer);
+    SYNC_THREADS;
+    gatherSums(numPartials, jumpPartials, jumpSums, buffer);
+    if (LOCAL_ID == 0) {
+        const wide u = evaluateMonitors(sums, groupEnergy, settings, values), next = evaluateMonitors(jumpSums, groupEnergy, settings, values);
+        if (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && u > 0 && next > 0 && next < (wide) 1e37f && fabs(next/u - 1) > (wide) SMALL_JUMP)
+            control[DENSITY_SCALE] = next/u;
+        hasJumped[0] = 0;
+    }
+}
+
+#endif
