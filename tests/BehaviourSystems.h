@@ -6,6 +6,7 @@
 
 // Systems on which the behaviours of both integrators are checked.
 
+#include "TestSupport.h"
 #include "openmm/Context.h"
 #include "openmm/CustomExternalForce.h"
 #include "openmm/State.h"
@@ -14,8 +15,6 @@
 #include <vector>
 
 namespace OpenMMVRattle {
-
-const double BOLTZMANN = 8.31446261815324e-3; // kJ/mol/K
 
 /** A number in [-0.5, 0.5) for each coordinate, as OpenMM's tests choose velocities. */
 inline OpenMM::Vec3 randomVec(std::mt19937& random) {

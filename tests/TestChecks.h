@@ -15,7 +15,6 @@
 
 namespace OpenMMVRattle {
 
-const double BOLTZMANN_CONSTANT = 8.31446261815324e-3; // kJ/mol/K
 const double NOT_A_NUMBER = std::numeric_limits<double>::quiet_NaN();
 const char DISTANCE[] = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)-d";
 
@@ -408,7 +407,7 @@ inline void testVelocitiesOfCoupledConstraints() {
         sum += context.getState(State::Energy).getKineticEnergy() / numSamples;
     }
     // 9 degrees of freedom: the mean of n samples has a relative standard deviation of sqrt(2/(9 n)).
-    ASSERT_EQUAL_TOL(0.5 * 9 * BOLTZMANN_CONSTANT * 300, sum, 4 * std::sqrt(2.0 / (9 * numSamples)));
+    ASSERT_EQUAL_TOL(0.5 * 9 * BOLTZMANN * 300, sum, 4 * std::sqrt(2.0 / (9 * numSamples)));
 }
 
 /*
@@ -420,7 +419,7 @@ inline void testVelocitiesOfCoupledConstraints() {
 inline void testMaxwellVelocities() {
     TestSystem t;
     makeBox(t, {Vec3(0, 0, 0.5), Vec3(0.1, 0, 0.5), Vec3(1, 1, 1)}, 5);
-    const double m1 = 1, m2 = 12, m3 = 3, kT = BOLTZMANN_CONSTANT * 250;
+    const double m1 = 1, m2 = 12, m3 = 3, kT = BOLTZMANN * 250;
     const vector<double> masses = {m1, m2, m3};
     for (int i = 0; i < 3; i++)
         t.system.setParticleMass(i, masses[i]);

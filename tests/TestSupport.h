@@ -23,6 +23,8 @@ namespace OpenMMVRattle {
 
 using OpenMM::throwException; // which OpenMM's ASSERT macros name without its namespace
 
+const double BOLTZMANN = 8.31446261815324e-3; // kJ/mol/K
+
 typedef std::vector<std::pair<std::string, std::function<void()>>> TestList;
 
 /** Run tests, report each that fails, and return the exit status of the program. */

@@ -22,7 +22,6 @@ namespace {
 
 typedef vector<Vec3> Vectors;
 
-const double BOLTZMANN = 0.00831446261815324;
 const vector<Vec3> SHAPE = {Vec3(), Vec3(0.1, 0, 0.01), Vec3(-0.03, 0.11, 0), Vec3(-0.02, -0.05, 0.09)};
 
 // Molecules of several shapes that attract and repel each other softly, so that steps of all sizes have solutions.

@@ -13,6 +13,7 @@
 #include "openmm/common/ContextSelector.h"
 #include "openmm/internal/AndersenThermostatImpl.h"
 #include "openmm/internal/ForceImpl.h"
+#include "openmm/reference/SimTKOpenMMRealType.h"
 
 using namespace OpenMMVRattle;
 using OpenMM::AndersenThermostat;
@@ -20,8 +21,6 @@ using OpenMM::ForceImpl;
 using std::vector;
 
 namespace {
-
-const double BOLTZMANN = 0.00831446261815324; // kJ/mol/K
 
 template <class Barostat> int frequencyOf(const OpenMM::Force& force) {
     const auto* barostat = dynamic_cast<const Barostat*>(&force);
@@ -115,7 +114,7 @@ void ForceActions::collide(OpenMM::ComputeArray& control) {
             thermostat->setArg(index, (float) value);
     };
     setReal(2, context.getParameter(AndersenThermostat::CollisionFrequency()));
-    setReal(3, BOLTZMANN * context.getParameter(AndersenThermostat::Temperature()));
+    setReal(3, BOLTZ * context.getParameter(AndersenThermostat::Temperature()));
     thermostat->setArg(5, control);
     thermostat->setArg(7, compute.getIntegrationUtilities().prepareRandomNumbers(2 * compute.getPaddedNumAtoms()));
     thermostat->execute(compute.getNumAtoms());

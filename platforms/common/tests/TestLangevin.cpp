@@ -22,8 +22,6 @@ using std::vector;
 
 namespace {
 
-const double BOLTZMANN_CONSTANT = 0.00831446261815324;
-
 std::string precision() {
     return getTestPlatform().getPropertyDefaultValue("Precision");
 }
@@ -277,7 +275,7 @@ void testTemperature() {
         double mean = 0;
         for (int i = 0; i < numSamples; i++) {
             run.integrator.step(10);
-            mean += 2 * run.kineticEnergy() / (degrees * BOLTZMANN_CONSTANT * numSamples);
+            mean += 2 * run.kineticEnergy() / (degrees * BOLTZMANN * numSamples);
         }
         sum += mean / numBlocks;
         squares += mean * mean / numBlocks;
@@ -406,7 +404,7 @@ void testExpressions() {
                 means[2] += system.getParticleMass((int) i) * v[i].dot(v[i]);
         }
         for (int k = 0; k < 3; k++) {
-            const double temperature = means[k] / (numSamples * degrees[k] * BOLTZMANN_CONSTANT);
+            const double temperature = means[k] / (numSamples * degrees[k] * BOLTZMANN);
             sums[k] += temperature / numBlocks;
             squares[k] += temperature * temperature / numBlocks;
         }

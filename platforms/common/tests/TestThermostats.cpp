@@ -59,7 +59,7 @@ void testTemperature() {
     t.begin(context);
     integrator.step(30);
     // Every dumbbell has collided; five degrees of freedom each.
-    const double expected = 0.5 * 5 * count * 0.00831446261815324 * 300;
+    const double expected = 0.5 * 5 * count * BOLTZMANN * 300;
     ASSERT(std::fabs(context.getState(State::Energy).getKineticEnergy() / expected - 1) <
            4 * std::sqrt(2.0 / (5 * count)));
 }

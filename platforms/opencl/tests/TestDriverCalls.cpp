@@ -1,12 +1,14 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// How often the host waits for the device. The functions of OpenCL that can wait are defined here once more, where the loader finds
-// them before those of the driver; they count and go on to those.
+// What a run asks of the device, OpenMM's part included: how often the host waits, what goes to and fro, and how many launches there are.
+// The functions of OpenCL that do it are defined here once more, where the loader finds them before those of the driver; they count and
+// go on to those.
 
 #include "../../common/tests/Dumbbells.h"
 #include "../../common/tests/GpuTests.h"
 
+#include "TestMovingParameters.h"
 #include "openmm/CMMotionRemover.h"
 #include "openmm/Context.h"
 #include "openmm/HarmonicBondForce.h"
@@ -14,16 +16,25 @@
 #include "openmm/VariableVerletIntegrator.h"
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
 #include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
+#include <cstddef>
 #include <cstdint>
 #include <dlfcn.h>
+#include <functional>
 
 namespace {
 
-int numWaits = 0, numLaunches = 0;
+struct Calls {
+    int waits = 0, downloads = 0, uploads = 0, launches = 0;
+    size_t bytes = 0; // of both ways
+};
+Calls calls;
 
 template <class Function> Function* findInDriver(const char* name) {
-    static void* driver = dlopen("libOpenCL.so.1", RTLD_NOW | RTLD_LOCAL);
-    return reinterpret_cast<Function*>(dlsym(driver, name));
+    static void* const driver = dlopen("libOpenCL.so.1", RTLD_LAZY | RTLD_LOCAL);
+    void* found = driver == nullptr ? nullptr : dlsym(driver, name);
+    if (found == nullptr)
+        throw OpenMM::OpenMMException(std::string("there is no ") + name);
+    return reinterpret_cast<Function*>(found);
 }
 
 } // namespace
@@ -33,41 +44,45 @@ extern "C" {
 
 int32_t clEnqueueReadBuffer(void* queue, void* buffer, uint32_t isBlocking, size_t offset, size_t size, void* to,
                             uint32_t numEvents, const void* events, void* event) {
-    static auto* original = findInDriver<decltype(clEnqueueReadBuffer)>("clEnqueueReadBuffer");
-    numWaits += isBlocking != 0;
+    static auto* const original = findInDriver<decltype(clEnqueueReadBuffer)>("clEnqueueReadBuffer");
+    calls.waits += isBlocking != 0;
+    calls.downloads++;
+    calls.bytes += size;
     return original(queue, buffer, isBlocking, offset, size, to, numEvents, events, event);
 }
 
 int32_t clEnqueueWriteBuffer(void* queue, void* buffer, uint32_t isBlocking, size_t offset, size_t size,
                              const void* from, uint32_t numEvents, const void* events, void* event) {
-    static auto* original = findInDriver<decltype(clEnqueueWriteBuffer)>("clEnqueueWriteBuffer");
-    numWaits += isBlocking != 0;
+    static auto* const original = findInDriver<decltype(clEnqueueWriteBuffer)>("clEnqueueWriteBuffer");
+    calls.waits += isBlocking != 0;
+    calls.uploads++;
+    calls.bytes += size;
     return original(queue, buffer, isBlocking, offset, size, from, numEvents, events, event);
 }
 
 void* clEnqueueMapBuffer(void* queue, void* buffer, uint32_t isBlocking, uint64_t flags, size_t offset, size_t size,
                          uint32_t numEvents, const void* events, void* event, int32_t* error) {
-    static auto* original = findInDriver<decltype(clEnqueueMapBuffer)>("clEnqueueMapBuffer");
-    numWaits += isBlocking != 0;
+    static auto* const original = findInDriver<decltype(clEnqueueMapBuffer)>("clEnqueueMapBuffer");
+    calls.waits += isBlocking != 0;
     return original(queue, buffer, isBlocking, flags, offset, size, numEvents, events, event, error);
 }
 
 int32_t clFinish(void* queue) {
-    static auto* original = findInDriver<decltype(clFinish)>("clFinish");
-    numWaits++;
+    static auto* const original = findInDriver<decltype(clFinish)>("clFinish");
+    calls.waits++;
     return original(queue);
 }
 
 int32_t clWaitForEvents(uint32_t numEvents, const void* events) {
-    static auto* original = findInDriver<decltype(clWaitForEvents)>("clWaitForEvents");
-    numWaits++;
+    static auto* const original = findInDriver<decltype(clWaitForEvents)>("clWaitForEvents");
+    calls.waits++;
     return original(numEvents, events);
 }
 
 int32_t clEnqueueNDRangeKernel(void* queue, void* kernel, uint32_t dimension, const size_t* offset, const size_t* size,
                                const size_t* groupSize, uint32_t numEvents, const void* events, void* event) {
-    static auto* original = findInDriver<decltype(clEnqueueNDRangeKernel)>("clEnqueueNDRangeKernel");
-    numLaunches++;
+    static auto* const original = findInDriver<decltype(clEnqueueNDRangeKernel)>("clEnqueueNDRangeKernel");
+    calls.launches++;
     return original(queue, kernel, dimension, offset, size, groupSize, numEvents, events, event);
 }
 }
@@ -78,12 +93,16 @@ using std::vector;
 
 namespace {
 
+Calls callsOf(const std::function<void()>& task) {
+    calls = Calls();
+    task();
+    return calls;
+}
+
 typedef VariableStepRattleIntegrator Integrator_;
 
 int countWaits(Integrator& integrator, int steps) {
-    numWaits = 0;
-    integrator.step(steps);
-    return numWaits;
+    return callsOf([&] { integrator.step(steps); }).waits;
 }
 
 // What Forces do to velocities in each step costs launches, and no look at the device but the one at the end.
@@ -100,13 +119,12 @@ void testThermostats() {
         t.begin(context);
         integrator.step(5);
         ASSERT_EQUAL(1, countWaits(integrator, 1));
-        numLaunches = 0;
-        integrator.step(10);
-        const int launchesOfTen = numLaunches;
-        ASSERT_EQUAL(1, countWaits(integrator, 100));
+        const int launchesOfTen = callsOf([&] { integrator.step(10); }).launches;
+        const Calls ofHundred = callsOf([&] { integrator.step(100); });
+        ASSERT_EQUAL(1, ofHundred.waits);
         ASSERT(integrator.isOnDevice());
         // In each step the same, but for the numbers of a thermostat that are drawn for many steps at once.
-        ASSERT(numLaunches - launchesOfTen <= 10 * launchesOfTen + 10);
+        ASSERT(ofHundred.launches <= 10 * launchesOfTen + 10);
         ASSERT_EQUAL(116, context.getStepCount());
         // OpenMM's 250 steps from one order of the atoms to the next make no difference where there is no cutoff.
         integrator.step(150);
@@ -158,9 +176,48 @@ void testBarostat() {
     ASSERT_EQUAL(1, countWaits(integrator, 30));
 }
 
+// Each step that moves a constraint, one after the other: one upload more than at rest, of 16 bytes, and a launch or two. Its multiplier is
+// one small download.
+void testTraffic() {
+    for (const auto& choice : allChoices()) {
+        if (choice.first == "automatic")
+            continue;
+        MovingRun run(choice.second);
+        run.step(1);
+        const int count = 20;
+        auto go = [&](bool isMoving) {
+            return callsOf([&] {
+                for (int i = 0; i < count; i++) {
+                    if (isMoving)
+                        run.moveConstraint();
+                    run.integrator.step(1);
+                }
+            });
+        };
+        go(false);
+        const Calls atRest = go(false);
+        run.moveConstraint();
+        run.integrator.step(1);
+        const Calls moving = go(true);
+        ASSERT(run.integrator.isOnDevice());
+        ASSERT_EQUAL(count, atRest.downloads); // the report at the end of step(1)
+        ASSERT_EQUAL(atRest.downloads, moving.downloads);
+        ASSERT_EQUAL(atRest.uploads + count, moving.uploads);
+        ASSERT_EQUAL(atRest.bytes + 16 * count, moving.bytes);
+        ASSERT_EQUAL(atRest.launches + (choice.first == "fixed" ? 1 : 2) * count, moving.launches);
+        const Calls multiplier = callsOf([&] { run.integrator.getExpressionConstraintMultiplier(0); });
+        ASSERT_EQUAL(1, multiplier.downloads);
+        ASSERT_EQUAL(0, multiplier.uploads);
+        ASSERT_EQUAL(8, multiplier.bytes);
+    }
+}
+
 } // namespace
 
 int main(int argc, char** argv) {
-    return runOnPlatform({{"thermostats", testThermostats}, {"OpenMM's own", testOpenMM}, {"barostat", testBarostat}},
+    return runOnPlatform({{"waits with thermostats", testThermostats},
+                          {"waits of OpenMM's own", testOpenMM},
+                          {"waits with a barostat", testBarostat},
+                          {"traffic of a constraint that moves", testTraffic}},
                          argc, argv);
 }
