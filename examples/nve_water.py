@@ -16,7 +16,8 @@ from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import rigid_waters
 
 water = rigid_waters(32)  # a droplet of 32 rigid TIP3P molecules at 300 K
-integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # ps
+# was: integrator = openmm.VerletIntegrator(0.001)
+integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # the step in ps
 simulation = app.Simulation(water.topology, water.system, integrator, *command_line_platform("CPU"))
 simulation.context.setPositions(water.positions)
 simulation.context.setVelocities(water.velocities)

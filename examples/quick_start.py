@@ -11,7 +11,8 @@ from openmmvrattle.platforms import command_line_platform
 from openmmvrattle.testsystems import double_pendulum
 
 pendulum = double_pendulum()
-integrator = VariableStepRattleIntegrator(0.0005, automatic=True)  # ps, the size of steps while nothing unusual happens
+# was: integrator = openmm.VerletIntegrator(0.0005)
+integrator = VariableStepRattleIntegrator(0.0005, automatic=True)  # the step in ps, while nothing unusual happens
 context = openmm.Context(pendulum.system, integrator, *command_line_platform("Reference"))
 context.setPositions(pendulum.positions)
 context.setVelocities(pendulum.velocities)

@@ -18,7 +18,7 @@ molecule = alanine_dipeptide()
 topology, system, positions = molecule.topology, molecule.system, molecule.positions
 
 # was: integrator = openmm.VerletIntegrator(0.001)
-integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # new: shorter steps when something unusual happens
+integrator = VariableStepRattleIntegrator(0.001, automatic=True)  # the step in ps
 
 simulation = app.Simulation(topology, system, integrator, *command_line_platform("CPU"))
 simulation.context.setPositions(positions)

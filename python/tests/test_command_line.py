@@ -419,7 +419,7 @@ def test_info() -> None:
             assert uses["monitors"] == uses["moving expressions"] == "device"
             assert re.search(rf"^  {name} +GPU ", result.stdout, re.MULTILINE)
     assert content["versions"]["openmm-vrattle"] == openmmvrattle.__version__
-    assert content["versions"]["OpenMM"].startswith("8.6")
+    assert content["versions"]["OpenMM"].startswith(openmm.version.short_version.rsplit(".", 1)[0])
     assert content["versions"]["SWIG runtime"].isdigit()
 
 

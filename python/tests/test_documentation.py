@@ -213,6 +213,13 @@ def test_the_recipe_is_the_same_everywhere(name: str) -> None:
     assert "\n".join(recipe) in first
 
 
+@pytest.mark.parametrize("name", ["quick_start", "swap_verlet", "nve_water"])
+def test_the_first_examples_have_the_recipe(name: str) -> None:
+    text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
+    was = r"# was: integrator = openmm\.VerletIntegrator\((.+)\)\n"
+    assert re.search(was + r"integrator = VariableStepRattleIntegrator\(\1, automatic=True\)  # the step in ps", text)
+
+
 @pytest.mark.parametrize("name", ["quick_start.py", "swap_verlet.py", "nve_water.py", "quick_tour.ipynb"])
 def test_an_example_to_begin_with_has_the_recipe(name: str) -> None:
     text = (ROOT / "examples" / name).read_text(encoding="utf-8")
@@ -257,7 +264,7 @@ def test_a_measured_table_says_where_it_is_from(page: Path) -> None:
     for name, block, end in blocks:
         assert name == end
         if block.strip():  # nobody has measured it yet
-            origin = r"\n\*(?:Written by|Pasted from the output of) `python (benchmarks/\w+\.py)[^`]*` o"
+            origin = r"\n\*Written by `python (benchmarks/\w+\.py)[^`]*` o"
             script = re.match(origin, block)
             assert script, f"the table {name} does not say where it is from"
             assert (ROOT / script[1]).exists()
