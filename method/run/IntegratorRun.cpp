@@ -424,14 +424,16 @@ RunState IntegratorRun::save() {
     // Settings that no step can be taken with: whatever becomes of them, the run will start afresh.
     if (canTakeSettings()) {
         takeSaved();
-        takeSettings();
+        bool areForcesValid = true;
         try {
             takeForcesOfOthers();
-            run.startsAfresh = task != Task::None;
         }
         catch (const StepFailure&) {
-            run.startsAfresh = true;
+            areForcesValid = false; // which is no reason not to save
         }
+        if (areForcesValid)
+            takeSettings();
+        run.startsAfresh = !areForcesValid || task != Task::None;
     }
     run.context = device.getFingerprint();
     run.parameters = device.getParameterFingerprint();
@@ -440,7 +442,7 @@ RunState IntegratorRun::save() {
     run.lastDensity = getStepDensity();
     run.references = getReferences();
     run.referenceTemperature = device.getReferenceTemperature();
-    run.randomState = getRandomState();
+    run.randomState = device.getRandomState();
     if (!run.startsAfresh)
         device.save(run);
     return run;

@@ -43,7 +43,7 @@ bool MonitorControl::setSettings(const StepSettings& newSettings, bool isInForce
     if (mustForget)
         forget();
     else
-        rescaleDensity(u);
+        rescaleDensity();
     return false;
 }
 
@@ -101,12 +101,12 @@ void MonitorControl::adopt(const StepMemory& memory) {
 }
 
 void MonitorControl::change(ChangeKind kind, double) {
-    if (!hasDensity)
-        forget();
     if (kind == Everything && !hasDensity) {
         begin();
         return;
     }
+    if (!hasDensity)
+        forget();
     if (kind == Frame && !monitor.usesVelocities())
         return;
     const bool isPlace = kind == Everything || kind == Forces;
@@ -117,13 +117,14 @@ void MonitorControl::change(ChangeKind kind, double) {
         monitor.requireValid(values);
     if (kind == Everything)
         densityOffset = 0;
-    rescaleDensity(u);
+    rescaleDensity();
 }
 
 // After a jump of the state: rho keeps its ratio to u, so that it starts no oscillation.
-void MonitorControl::rescaleDensity(double oldU) {
+void MonitorControl::rescaleDensity() {
     if (!hasDensity)
         return;
+    const double oldU = u;
     u = limit(values);
     if (u > 0 && oldU > 0)
         rho *= u / oldU;
@@ -246,18 +247,19 @@ void MonitorControl::accept() {
         densityOffset = rhoNext - densityScale * StepDensity::sumUpdate(u, rho);
     else if (hasDensity) // where the density would be at the end of the shortened step
         rhoNext = rho + (rhoNext - rho) * std::min(1.0, solver.size / (settings.stepSize / rhoNext));
+    const double uNext = limit(valuesNext);
     hasHalfStepValue = seesHalfStep();
     if (hasHalfStepValue) {
         halfStepValue = limit(valuesHalf);
         // Along F - G^T Lambda, which the last half of the kick has gone along.
-        rate = (limit(valuesNext) - halfStepValue) / (0.5 * solver.size);
+        rate = (uNext - halfStepValue) / (0.5 * solver.size);
     }
     values.swap(valuesNext);
     monitor.movedTo(now);
     if (hasDensity || solver.kind == StepSolver::First)
         rho = rhoNext;
     if (hasDensity)
-        u = limit(values);
+        u = uNext;
 }
 
 void MonitorControl::abandon() {

@@ -55,7 +55,7 @@ private:
     bool seesHalfStep() const;
     void look();
     void forget();
-    void rescaleDensity(double oldU);
+    void rescaleDensity();
     double limit(const std::vector<double>& monitorValues) const;
     double evaluateU(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& theta);
 

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/VRattleDynamics.h"
-#include <algorithm>
 #include <cmath>
 
 using namespace OpenMMVRattle;
@@ -14,7 +13,7 @@ namespace {
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
 // The part of the kinetic energy in a jump of the velocities that starts no oscillation to speak of.
-const double SMALL_JUMP = 1e-4;
+const double SMALL_JUMP_OF_ENERGY = 1e-4;
 
 } // namespace
 
@@ -86,7 +85,7 @@ double VRattleDynamics::step(double maxStep) {
         const double part = solver.motion.findJump(constraints, now.v, now.theta,
                                                    settings.stepSize / control->getDensity(), velocities);
         if (part >= 0)
-            control->jump(velocities, solver.motion.getJump(), part > SMALL_JUMP);
+            control->jump(velocities, solver.motion.getJump(), part > SMALL_JUMP_OF_ENERGY);
     }
     if (!control->hasStarted() && control->start())
         formHalfStepVelocities();

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,14 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT = 600  # s, for a program that another test runs: many times what it takes, for machines under load
+
+
+def run_command(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """`python -m openmmvrattle` with these arguments."""
+    return subprocess.run(
+        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=TIMEOUT, **options
+    )
 
 
 def load_script(path: str) -> ModuleType:

@@ -29,13 +29,8 @@ from openmmvrattle.testsystems import (
     light_heavy_chain,
     rigid_waters,
 )
+from project_scripts import run_command
 from run_support import needs_opencl, solvated
-
-
-def run_command(*arguments: str, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=600, **options
-    )
 
 
 def save(start: TestSystem, folder: Path, velocities: bool = True, positions: bool = True) -> tuple[Path, Path]:

@@ -34,6 +34,7 @@ from openmmvrattle.compare.comparison import (
     write_summary,
 )
 from openmmvrattle.testsystems import SYSTEMS, MonitorSettings, StepControl
+from project_scripts import run_command
 from rich.console import Console
 
 METHODS = ["fixed", "variable", "control", "vrattle", "vrattle"]
@@ -359,12 +360,6 @@ def test_table_is_whole(chain, width):
     for run in chain.runs:
         assert run.name in text or width > 80  # where it may be on two lines
         assert two_digits(run.largest_energy_error) in text
-
-
-def run_command(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=600, **options
-    )
 
 
 def test_command_line_writes_files(tmp_path):

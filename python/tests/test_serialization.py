@@ -333,6 +333,42 @@ def test_a_checkpoint_on_every_platform(water: TestSystem, platform: str) -> Non
 
 @pytest.mark.parametrize("is_set", [False, True])
 @pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+def test_a_checkpoint_where_forces_are_no_numbers(platform: str, is_set: bool) -> None:
+    """It can be written; what was loaded from it runs as soon as the forces are numbers again."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("k*(x^2+y^2+z^2)")
+    field.addGlobalParameter("k", 100)
+    for particle in range(3):
+        system.addParticle(12.0)
+        field.addParticle(particle)
+    system.addForce(field)
+
+    def open_here() -> tuple[openmm.Context, VariableStepRattleIntegrator]:
+        integrator = VariableStepRattleIntegrator(0.001, monitors=[VariableStepRattleIntegrator.AppliedForce])
+        properties = {"Precision": "double"} if platform == "OpenCL" else {}
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+        context.setPositions([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+        return context, integrator
+
+    context, integrator = open_here()
+    integrator.step(10)
+    context.setParameter("k", float("nan"))
+    context.getState(energy=True)
+    if is_set:
+        integrator.setConstraintTolerance(1e-7)
+    other, successor = open_here()
+    other.loadCheckpoint(context.createCheckpoint())
+    for each, run in ((context, integrator), (other, successor)):
+        with pytest.raises(openmm.OpenMMException, match="infinite or not a number"):
+            run.step(1)
+        each.setParameter("k", 100)
+        run.step(5)
+        assert each.getStepCount() == 15
+        assert np.isfinite(positions_of(each)).all()
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
 def test_a_checkpoint_after_a_parameter_has_changed(platform: str, is_set: bool) -> None:
     """The density is scaled with u, also where somebody has computed the new forces before, or changes a setting."""
     system = openmm.System()

@@ -40,18 +40,13 @@ from openmmvrattle.testsystems import (
     rigid_waters,
     water_clash,
 )
+from project_scripts import run_command
 from rich.console import Console
 
 
 def small_case(label="clash", **changes):
     clash = water_clash()
     return Case(clash, replace(clash.settings, total_time=0.05, force_evaluations=200), label=label, **changes)
-
-
-def run_command(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "openmmvrattle", *arguments], capture_output=True, text=True, timeout=600, **options
-    )
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

@@ -431,7 +431,14 @@ template <class Host> void CommonRunDevice<Host>::changeState() {
 template <class Host> void CommonRunDevice<Host>::changeForces() {
     settle();
     if (!isOnDevice || !hasBegun) {
-        takeToHost();
+        try {
+            takeToHost();
+        }
+        catch (const StepFailure&) { // the forces before were no numbers: there is nothing to compare with
+            hasForces = false;
+            takeToHost();
+            return;
+        }
         hasForces = false;
         Host::changeForces();
         return;
@@ -439,6 +446,8 @@ template <class Host> void CommonRunDevice<Host>::changeForces() {
     computeForces();
     changeOnDevice(Control::ForcesChanged);
     settle();
+    if (!hasBegun)
+        takeToHost(); // which says what is wrong
 }
 
 // Does not wait for the device where the next step is taken there.
