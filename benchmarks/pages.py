@@ -12,6 +12,7 @@ import datetime
 import os
 import platform
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +39,7 @@ def provenance(device: str | None = None) -> str:
     Args:
         device: what computed, if that was not the processor.
     """
-    command = " ".join([f"python benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
     today = datetime.date.today()
     return (
         f"*Written by `{command}` on {today.day} {today:%B %Y}: OpenMM-VRATTLE {openmmvrattle.__version__}, OpenMM "
