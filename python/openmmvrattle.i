@@ -149,5 +149,6 @@ RELEASES_GIL(VariableStepRattleLangevinIntegrator, getMonitorValue)
     }
 }
 %enddef
+CASTS(ConstrainedIntegrator)
 CASTS(VariableStepRattleIntegrator)
 CASTS(VariableStepRattleLangevinIntegrator)

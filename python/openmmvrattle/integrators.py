@@ -33,20 +33,6 @@ def _deprecated(name: str, instead: str) -> None:
     warnings.warn(f"{name} is deprecated: use {instead}", DeprecationWarning, stacklevel=3)
 
 
-def _cast(integrator: openmm.Integrator, wanted: type, compiled: Any) -> Any:
-    """Return the same Python object as a `wanted`, whose compiled class is `compiled`."""
-    if isinstance(integrator, wanted):
-        return integrator
-    typed = compiled._cast(integrator) if isinstance(integrator, openmm.Integrator) else None
-    if typed is None:
-        raise TypeError(f"a {type(integrator).__name__} is not a {wanted.__name__}")
-    typed.thisown = integrator.thisown
-    integrator.thisown = False
-    integrator.this = typed.this
-    integrator.__class__ = wanted
-    return integrator
-
-
 class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
     """What the compiled integrators have in common: constraints given as expressions, and their multipliers; counts of
     work; copies."""
@@ -324,6 +310,52 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         super().setExpressionConstraintParameters(
             integer(index, "index"), *constraint_arguments(expression, particles, parameters)
         )
+
+    @classmethod
+    def isinstance(cls, integrator: openmm.Integrator) -> bool:
+        """Get whether an integrator is of this class, though Python may know it as a bare openmm.Integrator.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            any integrator
+
+        Returns
+        -------
+        bool
+            whether cast() would take it
+        """
+        return isinstance(integrator, openmm.Integrator) and cls._isinstance(integrator)
+
+    @classmethod
+    def cast(cls, integrator: openmm.Integrator) -> Self:
+        """Make what OpenMM has returned as a bare openmm.Integrator one of this class again.
+
+        Parameters
+        ----------
+        integrator : Integrator
+            for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
+
+        Returns
+        -------
+        ConstrainedIntegrator
+            the same Python object, whose class is now this one
+
+        Raises
+        ------
+        TypeError
+            if it is an integrator of another kind
+        """
+        if isinstance(integrator, cls):
+            return integrator
+        typed = cls._cast(integrator) if isinstance(integrator, openmm.Integrator) else None
+        if typed is None:
+            raise TypeError(f"a {type(integrator).__name__} is not a {cls.__name__}")
+        typed.thisown = integrator.thisown
+        integrator.thisown = False
+        integrator.this = typed.this
+        integrator.__class__ = cls
+        return integrator
 
     def _attributes(self) -> dict[str, object]:
         """Return what Python code has attached to this integrator."""
@@ -1123,45 +1155,6 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         """
         super().reverse()
 
-    @staticmethod
-    def isinstance(integrator: openmm.Integrator) -> bool:
-        """Get whether an integrator is a VariableStepRattleIntegrator, though its class may be openmm.Integrator.
-
-        Parameters
-        ----------
-        integrator : Integrator
-            any integrator
-
-        Returns
-        -------
-        bool
-            whether cast() would take it
-        """
-        return isinstance(integrator, openmm.Integrator) and vrattle.VariableStepRattleIntegrator._isinstance(
-            integrator
-        )
-
-    @staticmethod
-    def cast(integrator: openmm.Integrator) -> VariableStepRattleIntegrator:
-        """Make what OpenMM has returned as a bare openmm.Integrator a VariableStepRattleIntegrator again.
-
-        Parameters
-        ----------
-        integrator : Integrator
-            for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
-
-        Returns
-        -------
-        VariableStepRattleIntegrator
-            the same Python object, whose class has been changed
-
-        Raises
-        ------
-        TypeError
-            if it is an integrator of another kind
-        """
-        return _cast(integrator, VariableStepRattleIntegrator, vrattle.VariableStepRattleIntegrator)
-
 
 class VariableStepRattleLangevinIntegrator(ConstrainedIntegrator, vrattle.VariableStepRattleLangevinIntegrator):
     """An integrator for Langevin dynamics, so at constant temperature, with constraints.
@@ -1450,43 +1443,3 @@ class VariableStepRattleLangevinIntegrator(ConstrainedIntegrator, vrattle.Variab
             if there is no Context
         """
         return super().getMonitorValue()
-
-    @staticmethod
-    def isinstance(integrator: openmm.Integrator) -> bool:
-        """Get whether an integrator is a VariableStepRattleLangevinIntegrator, though its class may be
-        openmm.Integrator.
-
-        Parameters
-        ----------
-        integrator : Integrator
-            any integrator
-
-        Returns
-        -------
-        bool
-            whether cast() would take it
-        """
-        return isinstance(integrator, openmm.Integrator) and vrattle.VariableStepRattleLangevinIntegrator._isinstance(
-            integrator
-        )
-
-    @staticmethod
-    def cast(integrator: openmm.Integrator) -> VariableStepRattleLangevinIntegrator:
-        """Make what OpenMM has returned as a bare openmm.Integrator a VariableStepRattleLangevinIntegrator again.
-
-        Parameters
-        ----------
-        integrator : Integrator
-            for example from openmm.XmlSerializer.deserialize() or CompoundIntegrator.getIntegrator()
-
-        Returns
-        -------
-        VariableStepRattleLangevinIntegrator
-            the same Python object, whose class has been changed
-
-        Raises
-        ------
-        TypeError
-            if it is an integrator of another kind
-        """
-        return _cast(integrator, VariableStepRattleLangevinIntegrator, vrattle.VariableStepRattleLangevinIntegrator)

@@ -356,6 +356,16 @@ def test_it_serializes_as_its_class() -> None:
         Langevin.cast(openmm.VerletIntegrator(0.001))
 
 
+def test_what_the_integrators_share_is_had_without_knowing_which_it_is() -> None:
+    for integrator in (Langevin(300, 1, 0.001), VariableStepRattleIntegrator(0.001)):
+        bare = openmm.XmlSerializer.clone(integrator)
+        assert ConstrainedIntegrator.isinstance(bare)
+        assert ConstrainedIntegrator.cast(bare).getNumExpressionConstraints() == 0
+        assert type(integrator).cast(bare) is bare
+        assert type(bare) is type(integrator)
+    assert not ConstrainedIntegrator.isinstance(openmm.VerletIntegrator(0.001))
+
+
 def test_states_of_the_other_integrator_load() -> None:
     system, positions = molecules()
     other = VariableStepRattleIntegrator(0.001)
