@@ -35,6 +35,13 @@ void ParameterMotion::setRates(ExpressionParameters& theta, double size) const {
         theta.rates[k] = change[k] / size;
 }
 
+// On a straight way, which ends at the target to the last bit.
+void ParameterMotion::follow(double time, double size, ExpressionParameters& theta) const {
+    setRates(theta, size);
+    for (size_t k = 0; k < change.size(); k++)
+        theta.values[k] = time < size ? start.values[k] + time / size * change[k] : target[k];
+}
+
 const ExpressionParameters& ParameterMotion::atStart(double size) {
     setRates(start, size);
     return start;

@@ -33,6 +33,8 @@ public:
     }
     /** Write the rates of the step, which has this size (ps). */
     void setRates(ExpressionParameters& theta, double size) const;
+    /** theta at a time of the step, which has this size, and its rates. */
+    void follow(double time, double size, ExpressionParameters& theta) const;
     /** theta[n] with the rates of a step of that size. */
     const ExpressionParameters& atStart(double size);
     /** Where a step of that size has come from that moves parameters as this one. */

@@ -42,14 +42,13 @@ bool isFinite(const Vec3& x) {
 
 LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                    const vector<ExpressionConstraint>& expressions) :
-        solver(masses, constraints, expressions), clusterForces(solver), groupEnergy(0), values(1, 0.0), reference(0),
+        solver(masses, constraints, expressions), motion(solver.getSystem()), clusterForces(solver), groupEnergy(0), values(1, 0.0), reference(0),
         lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1), isInProgress(false),
         isAtStart(false), doublings(0), substep(0), systemSize(0) {
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     noForce.resize(getConstraintSystem().getNumParticles());
     theta = thetaNow = thetaMiddle = thetaNext = getConstraintSystem().getGivenParameters();
-    target = parameterChange = theta.values;
     clusterSums.resize(clusterForces.getNumClusters());
     clusterForces.sumOverClusters([](int) { return 1.0; }, clusterSums);
     systemSize = clusterForces.eighthRootOfFourthPowers(clusterSums);
@@ -173,14 +172,12 @@ bool LangevinDynamics::projectPositions(Vectors& positions) {
 }
 
 void LangevinDynamics::adoptParameters() {
-    theta.values = target;
+    theta.values = motion.target;
 }
 
 void LangevinDynamics::begin(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
                              double energy) {
-    target = theta.values;
-    std::fill(theta.rates.begin(), theta.rates.end(), 0.0);
-    theta.isMoving = false;
+    motion.rest(theta);
     takeState(positions, velocities, forces, energy);
 }
 
@@ -230,10 +227,10 @@ void LangevinDynamics::evaluateOnStep() {
 }
 
 std::function<void()> LangevinDynamics::remember() {
-    return [this, positions = q, velocities = v, forces = force, energy = groupEnergy, nextParameters = target,
+    return [this, positions = q, velocities = v, forces = force, energy = groupEnergy, nextParameters = motion.target,
             memory = getMemory()] {
         resume(positions, velocities, forces, energy, memory);
-        target = nextParameters;
+        motion.target = nextParameters;
     };
 }
 
@@ -346,7 +343,7 @@ double LangevinDynamics::step(double) {
     if (!isInProgress) {
         solver.beginStep();
         startReference();
-        getConstraintSystem().findParameterChange(q, theta, target, parameterChange);
+        motion.prepare(q, theta);
         doublings = std::min(findDoublings(values[0]), settings.langevin.maxDoublings);
         startAttempt();
     }
@@ -383,17 +380,6 @@ void LangevinDynamics::raise(const std::string& reason) {
     startAttempt();
 }
 
-// Where the parameters are at a time of the step, on a straight way.
-void LangevinDynamics::setParametersAt(double time, ExpressionParameters& parameters) const {
-    const double part = time / settings.stepSize;
-    parameters.isMoving = false;
-    for (size_t k = 0; k < target.size(); k++) {
-        parameters.values[k] = part < 1 ? theta.values[k] + part * parameterChange[k] : target[k];
-        parameters.rates[k] = parameterChange[k] / settings.stepSize;
-        parameters.isMoving = parameters.isMoving || parameterChange[k] != 0;
-    }
-}
-
 // The first half of a substep, to qNext and wNext. Returns whether its equations have been solved.
 bool LangevinDynamics::trySubstep(std::string& reason) {
     const bool isFirst = substep == 0;
@@ -401,11 +387,11 @@ bool LangevinDynamics::trySubstep(std::string& reason) {
     const vector<double>& guess = isFirst ? lambda : lambdaNow;
     const int substeps = LangevinSettings::getSubsteps(doublings);
     const double d = findSubstep(), end = substep + 1 == substeps ? settings.stepSize : (substep + 1) * d;
-    setParametersAt(end, thetaNext);
+    motion.follow(end, settings.stepSize, thetaNext);
     if (2 * substep + 1 != substeps)
         return tryDrift({start, 0.5 * d, d, thetaNext, qNext, wNext, multipliers}, guess, reason);
 
-    setParametersAt(0.5 * settings.stepSize, thetaMiddle);
+    motion.follow(0.5 * settings.stepSize, settings.stepSize, thetaMiddle);
     if (!tryDrift({start, 0.5 * d, 0.5 * d, thetaMiddle, qMiddle, wMiddle, multipliers}, guess, reason))
         return false;
     addNoise(wMiddle);

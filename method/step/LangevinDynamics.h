@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_LANGEVINDYNAMICS_H_
 
 #include "constraints/ConstraintSolver.h"
+#include "constraints/ParameterMotion.h"
 #include "openmm/Vec3.h"
 #include "step/ClusterForces.h"
 #include "step/LangevinSettings.h"
@@ -78,14 +79,14 @@ public:
     void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                 const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const Memory& memory);
     void setParameters(int expression, const std::map<std::string, double>& parameters) {
-        getConstraintSystem().writeParameters(expression, parameters, target);
+        getConstraintSystem().writeParameters(expression, parameters, motion.target);
     }
     const ExpressionParameters& getParameters() const {
         return theta;
     }
     /** Whether the parameters are the same in the last step and the next. */
     bool areParametersAtRest() const {
-        return target == theta.values && !theta.isMoving;
+        return motion.isAtRest(theta);
     }
     void adoptParameters();
     void setReferences(const std::vector<double>& references);
@@ -207,12 +208,12 @@ private:
     void raise(const std::string& reason);
     bool trySubstep(std::string& reason);
     bool tryDrift(const ConstraintSolver::Trial& trial, const std::vector<double>& guess, std::string& reason);
-    void setParametersAt(double time, ExpressionParameters& parameters) const;
     double findSubstep() const {
         return settings.stepSize / LangevinSettings::getSubsteps(doublings);
     }
 
     ConstraintSolver solver;
+    ParameterMotion motion;
     ClusterForces clusterForces;
     Settings settings;
 
@@ -220,7 +221,6 @@ private:
     Vectors q, v, force;
     double groupEnergy;
     ExpressionParameters theta;  // theta[n], with the rates of the step that has led to q[n]
-    std::vector<double> target;  // theta[n+1], what the next step leads to
     std::vector<double> lambda;  // Lambda(q[n],p[n])
     std::vector<double> values;  // U(q[n],p[n]), alone
     double reference;            // U_ref, 0 while it is not known
@@ -239,7 +239,6 @@ private:
     Vectors qMiddle, wMiddle, noForce;   // in the middle of the central drift
     Vectors qNext, wNext, vNext;         // at its end, the velocities before the half kick and on step
     ExpressionParameters thetaNow, thetaMiddle, thetaNext;
-    std::vector<double> parameterChange; // theta[n+1] - theta[n]
     std::vector<double> lambdaNow, lambdaNext, multipliers, noMultipliers, rightSide;
     std::vector<double> clusterSums; // A_c
     double systemSize;                   // S
