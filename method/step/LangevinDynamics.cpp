@@ -42,9 +42,9 @@ bool isFinite(const Vec3& x) {
 
 LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<DistanceConstraint>& constraints,
                                    const vector<ExpressionConstraint>& expressions) :
-        solver(masses, constraints, expressions), motion(solver.getSystem()), clusterForces(solver), groupEnergy(0), values(1, 0.0), reference(0),
-        lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1), isInProgress(false),
-        isAtStart(false), doublings(0), substep(0), systemSize(0) {
+        solver(masses, constraints, expressions), motion(solver.getSystem()), clusterForces(solver), groupEnergy(0),
+        values(1, 0.0), reference(0), lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1),
+        isInProgress(false), isAtStart(false), doublings(0), substep(0), systemSize(0) {
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     noForce.resize(getConstraintSystem().getNumParticles());
