@@ -117,6 +117,7 @@ inline vector<Deed> getStages() {
 inline vector<Deed> getAttempts(int count) {
     vector<Deed> attempts = {
         {"step", [](WatchedChain& c) { c.integrator.step(1); }},
+        {"setVelocitiesToTemperature", [](WatchedChain& c) { c.integrator.setVelocitiesToTemperature(300, 1); }},
         {"stepTo", [](WatchedChain& c) { c.integrator.stepTo(c.context->getTime() + 0.00002); }},
         {"calibrate",
          [](WatchedChain& c) {
@@ -203,7 +204,7 @@ inline void testForcesThatFail() {
     size_t turn = 0; // not every deed follows every failure, but each comes in turn
     for (const char* control : getControls())
         for (const Deed& stage : getStages())
-            for (const Deed& attempt : getAttempts(isOnGpu() ? 2 : 5))
+            for (const Deed& attempt : getAttempts(isOnGpu() ? 3 : 6))
                 for (const auto failure : {Watch::Raises, Watch::NotANumber})
                     for (int evaluation = 1;; evaluation++) {
                         bool hasFailed = false;

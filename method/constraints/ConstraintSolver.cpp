@@ -775,6 +775,17 @@ std::string ConstraintSolver::explainFailure(const Trial& trial) {
     return explain(*q, *theta, acceleration, "");
 }
 
+std::string ConstraintSolver::explainForces(const Vectors& forces) const {
+    auto square = [&](int i) { return forces[i].dot(forces[i]); };
+    int worst = movingParticles[0];
+    for (int i : movingParticles)
+        if (std::isfinite(square(worst)) && !(square(i) <= square(worst)))
+            worst = i;
+    const bool isFinite = std::isfinite(forces[worst][0] + forces[worst][1] + forces[worst][2]);
+    return "the force on particle " + std::to_string(worst) +
+           (isFinite ? " is too large to compute with" : " is infinite or not a number");
+}
+
 // The way out is for what has no explanation of its own.
 std::string ConstraintSolver::explain(const Vectors& from, const ExpressionParameters& parameters,
                                       const Vectors& displacement, const std::string& wayOut) {
@@ -794,7 +805,7 @@ std::string ConstraintSolver::explain(const Vectors& from, const ExpressionParam
         reason << system.describe(worst) << " could not be solved for (relative error " << lastError << " left)"
                << wayOut;
     else if (system.isExpression(worst) && !std::isfinite(residual[worst]))
-        reason << system.describe(worst) << " became " << residual[worst];
+        reason << system.describe(worst) << " became infinite or not a number";
     else
         reason << "the constraints could not be solved for (the iteration diverged)" << wayOut;
     return reason.str();

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "constraints/ConstraintSystem.h"
+#include "constraints/StepFailure.h"
 #include <algorithm>
 #include <cmath>
 #include <map>
@@ -19,14 +20,6 @@ namespace {
 const double STRONG_CURVATURE = 0.25, SHARPNESS = 0.1;
 // Lengths of a molecule in a line add up but for this fraction, which files may round them by.
 const double LINE_ROUNDING = 1e-6;
-
-std::string listParticles(const vector<int>& particles) {
-    const size_t maxListed = 12;
-    std::string text = particles.size() == 1 ? "particle " : "the particles ";
-    for (size_t i = 0; i < particles.size() && i < maxListed; i++)
-        text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
-    return particles.size() > maxListed ? text + ", ... (" + std::to_string(particles.size()) + " in all)" : text;
-}
 
 } // namespace
 

@@ -10,6 +10,14 @@
 
 namespace OpenMMVRattle {
 
+/** Particles for a message, the first of them where they are many. */
+inline std::string listParticles(const std::vector<int>& particles, size_t maxListed = 12) {
+    std::string text = particles.size() == 1 ? "particle " : "the particles ";
+    for (size_t i = 0; i < particles.size() && i < maxListed; i++)
+        text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
+    return particles.size() > maxListed ? text + ", ... (" + std::to_string(particles.size()) + " in all)" : text;
+}
+
 /** A step, or the start of a run, could not be completed. The state before it is untouched. */
 class StepFailure : public std::runtime_error {
 public:
@@ -31,14 +39,9 @@ public:
 
 private:
     static std::string describe(const std::vector<int>& particles) {
-        const size_t maxListed = 12;
-        std::string text = "the constraints among the particles ";
-        for (size_t i = 0; i < particles.size() && i < maxListed; i++)
-            text += (i == 0 ? "" : i + 1 == particles.size() ? " and " : ", ") + std::to_string(particles[i]);
-        if (particles.size() > maxListed)
-            text += ", ... (" + std::to_string(particles.size()) + " in all)";
-        return text + " are redundant or nearly so in the current configuration; remove one of them if they are so in "
-                      "every configuration";
+        return "the constraints " + std::string(particles.size() == 1 ? "of " : "among ") + listParticles(particles) +
+               " are redundant or nearly so in the current configuration; remove one of them if they are so in every "
+               "configuration";
     }
 };
 

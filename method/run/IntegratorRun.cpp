@@ -179,20 +179,28 @@ void IntegratorRun::takeSaved() {
 
 // Bring the method's state in line with the Context, which may have been changed in between.
 void IntegratorRun::prepare(bool areForcesInvalid, bool isForStep) {
+    findTask(areForcesInvalid, isForStep);
+    fulfilTask();
+}
+
+void IntegratorRun::findTask(bool areForcesInvalid, bool isForStep) {
     takeSaved();
     takeSettings();
     // Constraints with new parameters are met by the next step, which moves them there. Whoever asks for numbers before the first
     // step asks for those of a run that starts where they hold.
     if (isAtStart && areParametersNew && !isForStep)
         task = Task::Start;
+    const RunDevice::Change change = device.findChange();
+    if (areForcesInvalid || change == RunDevice::Change::State) // a barostat, say
+        task = std::max(task, Task::ChangeState);
+    else if (change == RunDevice::Change::Box) // a new box without a word of a Force is the user's
+        task = Task::Start;
+    else if (change == RunDevice::Change::Velocities)
+        task = std::max(task, Task::ChangeVelocities);
+}
+
+void IntegratorRun::fulfilTask() {
     try {
-        const RunDevice::Change change = device.findChange();
-        if (areForcesInvalid || change == RunDevice::Change::State) // a barostat, say
-            task = std::max(task, Task::ChangeState);
-        else if (change == RunDevice::Change::Box) // a new box without a word of a Force is the user's
-            task = Task::Start;
-        else if (change == RunDevice::Change::Velocities)
-            task = std::max(task, Task::ChangeVelocities);
         if (task == Task::Start)
             device.start();
         else if (task == Task::ChangeState)
@@ -286,8 +294,18 @@ void IntegratorRun::reverse() {
     toldDensity.reset();
 }
 
-void IntegratorRun::projectVelocities() {
-    prepare(false);
+void IntegratorRun::replaceVelocities(const std::function<void()>& set, const std::function<void()>& putBack) {
+    findTask(false, false);
+    const Task before = task;
+    try {
+        set();
+        fulfilTask();
+    }
+    catch (...) {
+        putBack();
+        task = before; // whatever has been announced, all is as it was
+        throw;
+    }
     device.writeVelocities();
 }
 

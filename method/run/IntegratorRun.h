@@ -7,6 +7,7 @@
 #include "run/IntegratorSettings.h"
 #include "run/RunDevice.h"
 #include "run/RunState.h"
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -42,8 +43,11 @@ public:
     void step(int count);
     void stepTo(double time);
     void reverse();
-    /** Move the Context's velocities onto the constraints, as a start does. */
-    void projectVelocities();
+    /**
+     * Let the Context have other velocities, and move them onto the constraints as a start does. Where no run can start with them,
+     * all is as before.
+     */
+    void replaceVelocities(const std::function<void()>& set, const std::function<void()>& putBack);
     /** The mean of each monitor over a trial run from the current state, which stays as it is. */
     std::vector<double> calibrate(int steps);
 
@@ -92,6 +96,8 @@ private:
     void takeParameters();
     void takeSaved();
     void prepare(bool areForcesInvalid, bool isForStep = false);
+    void findTask(bool areForcesInvalid, bool isForStep);
+    void fulfilTask();
     std::vector<double> getReferences();
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);

@@ -121,7 +121,7 @@ void VRattleRun::changeForces(const vector<Vec3>& forces, double energy) {
     const double forceSquared =
         std::max(constraints.sumOfSquares(forces, inverseMasses), constraints.sumOfSquares(now.force, inverseMasses));
     if (!std::isfinite(changeSquared))
-        throw StepFailure("the force on a particle is infinite or not a number");
+        throw StepFailure(constraints.explainForces(forces));
     attempt([&] {
         now.force = forces;
         now.groupEnergy = energy;

@@ -195,7 +195,7 @@ void AutomaticSteps::requireFiniteForces(const vector<Vec3>& forces) {
     forcesAhead = nullptr;
     for (double sum : blockSums)
         if (!std::isfinite(sum))
-            throw StepFailure("the force on a particle is infinite or not a number");
+            throw StepFailure(constraints.explainForces(forces));
 }
 
 bool AutomaticSteps::measure() {

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/ClusterForces.h"
+#include "constraints/StepFailure.h"
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -42,17 +43,9 @@ const vector<Vec3>& ClusterForces::findNetForces(const vector<Vec3>& positions, 
 }
 
 std::string ClusterForces::describe(int cluster) const {
-    const size_t maxListed = 4;
     const vector<int> members(particles.begin() + firstParticles[cluster],
                               particles.begin() + firstParticles[cluster + 1]);
-    if (members.size() == 1)
-        return "particle " + std::to_string(members[0]);
-    std::string text = "the cluster of the particles ";
-    for (size_t i = 0; i < members.size() && i < maxListed; i++)
-        text += (i == 0 ? "" : i + 1 == members.size() ? " and " : ", ") + std::to_string(members[i]);
-    if (members.size() > maxListed)
-        text += ", ... (" + std::to_string(members.size()) + " in all)";
-    return text;
+    return (members.size() == 1 ? "" : "the cluster of ") + listParticles(members, 4);
 }
 
 double ClusterForces::eighthRootOfFourthPowers(const vector<double>& x) const {

@@ -215,9 +215,8 @@ void LangevinDynamics::settle() {
 
 // P v, Lambda and U at q.
 void LangevinDynamics::evaluateOnStep() {
-    const int lost = findNotFinite(force);
-    if (lost >= 0)
-        throw StepFailure("the force on particle " + std::to_string(lost) + " is infinite or not a number");
+    if (findNotFinite(force) >= 0)
+        throw StepFailure(solver.explainForces(force));
     wNext = v;
     solver.moveTo(q, theta, force);
     solver.finish({q, wNext, force, theta, 0.0, v, lambda, rightSide, nullptr});

@@ -4,6 +4,7 @@
 #include "step/StepMonitor.h"
 #include <algorithm>
 #include <cmath>
+#include <sstream>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -245,13 +246,21 @@ void StepMonitor::evaluate(const vector<Vec3>& v, const vector<double>& multipli
 
 void StepMonitor::requireValid(const vector<double>& values) const {
     if (!std::isfinite(forceSquared))
-        throw StepFailure("the force on a particle is infinite or not a number");
-    for (size_t k = 0; k < terms.size(); k++)
-        if (!(values[k] >= 0) || !std::isfinite(values[k]))
-            throw StepFailure("monitor " + std::to_string(k) + " became " + std::to_string(values[k]) +
-                              (terms[k].kind == ForceGroupEnergy
-                                   ? ", while the energy of the monitor's force group must stay positive"
-                                   : ", while a monitor must stay positive and finite"));
+        throw StepFailure(solver.explainForces(*forces));
+    for (size_t k = 0; k < terms.size(); k++) {
+        if (values[k] >= 0 && std::isfinite(values[k]))
+            continue;
+        std::stringstream reason;
+        reason << "monitor " << k << " became ";
+        if (std::isfinite(values[k]))
+            reason << values[k];
+        else
+            reason << "infinite or not a number";
+        reason << (terms[k].kind == ForceGroupEnergy
+                       ? ", while the energy of the monitor's force group must stay positive"
+                       : ", while a monitor must stay positive and finite");
+        throw StepFailure(reason.str());
+    }
 }
 
 bool StepMonitor::isNegligible(int index, double value, const StepState& state, double speed, double acceleration) {

@@ -277,14 +277,9 @@ void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int r
     }
     vector<OpenMM::Vec3> before;
     context->getVelocities(before);
-    context->setVelocities(drawMaxwellVelocities(context->getSystem(), temperature, randomSeed));
-    try {
-        inContext.projectVelocities();
-    }
-    catch (...) {
-        context->setVelocities(before);
-        throw;
-    }
+    inContext.replaceVelocities(
+        [&] { context->setVelocities(drawMaxwellVelocities(context->getSystem(), temperature, randomSeed)); },
+        [&] { context->setVelocities(before); });
 }
 
 void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {

@@ -637,12 +637,12 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         Parameters
         ----------
         size : float or Quantity
-            the nominal step size (in ps): positive, and between the step bounds where these have been set
+            the nominal step size (in ps); 0 where no step is to be taken
 
         Raises
         ------
         OpenMMException
-            if size is not a positive finite number between the step bounds
+            if size is negative or not finite
         """
         super().setStepSize(number(size, "size", _TIME))
 

@@ -438,6 +438,32 @@ def test_failing_force(update: str, failure: str, platform: str) -> None:
         assert np.array_equal(undisturbed, disturbed)
 
 
+@pytest.mark.parametrize("control", ["monitor", "automatic", "fixed"])
+def test_a_force_that_is_no_number_names_its_particle(control: str, platform: str) -> None:
+    model = chain()
+    system = model.system()
+    force = openmm.CustomExternalForce("k*select(step(limit-x), x, sqrt(limit-x))")
+    force.addGlobalParameter("k", 1.0)
+    force.addGlobalParameter("limit", 10.0)
+    for i in (5, 3):
+        force.addParticle(i)
+    system.addForce(force)
+    integrator = VariableStepRattleIntegrator(0.0005, automatic=control == "automatic")
+    if control == "fixed":
+        integrator.clearMonitors()
+    context = open_context(system, integrator, platform, model)
+    for name, bad, words in [("limit", -10.0, "is infinite or not a number"), ("k", 1e200, "is too large to compute")]:
+        for steps in (0, 2):  # at the start, and in the course of a run
+            context.setPositions(model.positions)
+            integrator.step(steps)
+            good = context.getParameter(name)
+            context.setParameter(name, bad)
+            with pytest.raises(openmm.OpenMMException, match=f"because the force on particle [35] {words}"):
+                integrator.step(1)
+            context.setParameter(name, good)
+            integrator.step(1)
+
+
 def test_failed_step_says_when_and_what_to_change(platform: str) -> None:
     model = double_pendulum()
     integrator = VariableStepRattleIntegrator(0.01)

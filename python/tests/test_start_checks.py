@@ -9,8 +9,10 @@ import math
 import numpy as np
 import openmm
 import pytest
+from dense_reference import positions_of, waters
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator, constraints, testsystems
+from run_support import needs_opencl
 
 KB = 0.00831446261815324
 """Boltzmann's constant in kJ/mol/K."""
@@ -94,6 +96,28 @@ def test_seeds_and_arguments() -> None:
         integrator.setVelocitiesToTemperature(300 * unit.nanometer)
     with pytest.raises(openmm.OpenMMException, match="the temperature must be a finite number of kelvins"):
         integrator.setVelocitiesToTemperature(-300)
+
+
+@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+def test_velocities_that_are_refused_leave_no_trace(platform: str) -> None:
+    """The run goes on with its density, as if they had never been asked for; on a GPU too, where it had stepped."""
+    model = waters()
+    ends = []
+    for temperature in (None, 1e30):
+        integrator = VariableStepRattleIntegrator(0.0005)
+        context = openmm.Context(model.system(), integrator, openmm.Platform.getPlatformByName(platform))
+        context.setPositions(model.positions)
+        context.setVelocities(model.velocities)
+        integrator.step(6)
+        assert integrator.isOnDevice() == (platform != "Reference")
+        if temperature is not None:
+            with pytest.raises(openmm.OpenMMException, match="faster than light"):
+                integrator.setVelocitiesToTemperature(temperature, 1)
+        integrator.step(6)
+        ends.append((positions_of(context), integrator.getStepDensity()))
+    allowed = 0 if platform == "Reference" else 1e-12
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=allowed)
+    assert abs(ends[0][1] - ends[1][1]) <= allowed
 
 
 def test_three_particles_in_a_line() -> None:

@@ -405,13 +405,21 @@ template <class Host> unsigned long long CommonRunDevice<Host>::getFingerprint()
 
 template <class Host> void CommonRunDevice<Host>::start() {
     settle();
+    const bool wasOnDevice = isOnDevice, wasOnHost = isOnHost;
     if (!isOnHost)
         carryOn(state);
     isOnDevice = false;
     isOnHost = true;
     hasForces = false;
     correctMasses();
-    Host::start();
+    try {
+        Host::start();
+    }
+    catch (...) {
+        isOnDevice = wasOnDevice;
+        isOnHost = wasOnHost;
+        throw;
+    }
     knownCount = vectors->getStepCount();
 }
 
