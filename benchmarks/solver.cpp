@@ -1,14 +1,14 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 //
-// Steps of VRattleDynamics alone, without forces, a Context or a platform: OpenMM prepares its own constraint solver for
+// Steps of VRattleRun alone, without forces, a Context or a platform: OpenMM prepares its own constraint solver for
 // every Context of the platforms Reference and CPU, which takes minutes for 200,000 coupled bonds. benchmarks/scaling.py
 // writes the problem and reads the JSON line.
 //
 //     solver PROBLEM STEP STEPS REPEATS Explicit|SemiExplicit THREADS
 
 #include "openmm/internal/ThreadPool.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <algorithm>
 #include <chrono>
 #include <cmath>
@@ -71,7 +71,7 @@ int main(int argc, char** argv) {
 
     const double before = kilobytes();
     const double begin = seconds();
-    VRattleDynamics dynamics(masses, constraints);
+    VRattleRun dynamics(masses, constraints);
     const double constructed = seconds();
     OpenMM::ThreadPool threads(std::stoi(argv[6]));
     dynamics.setParallel(
@@ -84,7 +84,7 @@ int main(int argc, char** argv) {
             threads.waitForThreads();
         },
         threads.getNumThreads());
-    VRattleDynamics::Settings settings = {};
+    VRattleRun::Settings settings = {};
     settings.stepSize = stepSize;
     settings.minimumStep = stepSize / 50;
     settings.maximumStep = 2 * stepSize;

@@ -15,6 +15,8 @@ class ParameterMotion {
 public:
     /** A rate of a parameter that changes by more than this part of itself is a sudden one; one that doubles is not. */
     static constexpr double SUDDEN_CHANGE = 0.51;
+    /** The part of the kinetic energy in a jump of the velocities that starts no oscillation to speak of: 1% of their size. */
+    static constexpr double SMALL_JUMP = 1e-4;
     explicit ParameterMotion(const ConstraintSystem& system);
     /** theta[n+1], what the next step leads to. */
     std::vector<double> target;

@@ -106,8 +106,8 @@ long long HostVRattleDevice::getNumShortSteps() {
 
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
-void HostVRattleDevice::exchange(StepState& state, StepMemory& memory, RunState::Archive archive, size_t numMonitors,
-                                 bool isAutomatic) const {
+void HostVRattleDevice::exchange(StepState& state, VRattleRun::Memory& memory, RunState::Archive archive,
+                                 size_t numMonitors, bool isAutomatic) const {
     const size_t numConstraints = state.lambda.size(), numParameters = state.theta.values.size();
     archive.add("hasDensity", memory.hasDensity);
     archive.add("density", memory.rho);
@@ -115,9 +115,8 @@ void HostVRattleDevice::exchange(StepState& state, StepMemory& memory, RunState:
     archive.add("parameterRates", state.theta.rates, numParameters);
     archive.add("multiplierOffset", state.offset.found, numConstraints);
     archive.add("multipliers", state.lambda, numConstraints);
-    archive.add("monitorValues", memory.values, numMonitors);
+    archive.add("monitorValues", state.values, numMonitors);
     archive.add("hasHalfStepValue", memory.hasHalfStepValue);
-    archive.add("u", memory.u);
     archive.add("halfStepValue", memory.halfStepValue);
     archive.add("rate", memory.rate);
     archive.add("densityOffset", memory.densityOffset);
@@ -148,11 +147,13 @@ void HostVRattleDevice::saveMethod(RunState& run) {
     run.halfStepVelocities = kept.state.w;
     for (size_t k = 0; k < kept.state.lambda.size(); k++) // the difference is all that counts
         kept.state.offset.found[k] -= kept.state.offset.expected[k];
-    exchange(kept.state, kept.memory, RunState::Archive(run), kept.memory.values.size(), settings.isAutomatic);
+    if (settings.isAutomatic)
+        kept.state.values.clear(); // which were of monitors
+    exchange(kept.state, kept.memory, RunState::Archive(run), kept.state.values.size(), settings.isAutomatic);
 }
 
 void HostVRattleDevice::read(const RunState& run, const IntegratorSettings& saved, StepState& state,
-                             StepMemory& memory) const {
+                             VRattleRun::Memory& memory) const {
     exchange(state, memory, RunState::Archive(run), saved.monitors.size(), saved.isAutomatic);
     const vector<double>& rates = state.theta.rates;
     state.theta.isMoving = std::any_of(rates.begin(), rates.end(), [](double rate) { return rate != 0; });
@@ -162,14 +163,14 @@ void HostVRattleDevice::read(const RunState& run, const IntegratorSettings& save
 
 bool HostVRattleDevice::canResume(const RunState& run, const IntegratorSettings& saved) {
     StepState state(vrattle.getConstraintSystem());
-    StepMemory memory;
+    VRattleRun::Memory memory;
     read(run, saved, state, memory);
     return state.w.size() == masses.size();
 }
 
 void HostVRattleDevice::resumeMethod(const State& from, const RunState& run, const IntegratorSettings& saved) {
     StepState state(vrattle.getConstraintSystem());
-    StepMemory memory;
+    VRattleRun::Memory memory;
     read(run, saved, state, memory);
     state.q = from.positions;
     state.v = from.velocities;

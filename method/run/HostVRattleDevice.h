@@ -32,9 +32,9 @@ protected:
     void setMethod(const IntegratorSettings& settings) override;
     void saveMethod(RunState& run) override;
     void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) override;
-    void exchange(StepState& state, StepMemory& memory, RunState::Archive archive, size_t numMonitors,
+    void exchange(StepState& state, VRattleRun::Memory& memory, RunState::Archive archive, size_t numMonitors,
                   bool isAutomatic) const;
-    void read(const RunState& run, const IntegratorSettings& saved, StepState& state, StepMemory& memory) const;
+    void read(const RunState& run, const IntegratorSettings& saved, StepState& state, VRattleRun::Memory& memory) const;
     VRattleRun& vrattle = method;
     StepSettings settings;
     /** A trial run, and what is to be put back after it. */

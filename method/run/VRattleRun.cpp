@@ -23,7 +23,14 @@ void VRattleRun::putBack(const Kept& kept) {
     solver.setSettings(settings.stepSize, settings.tolerance);
     constraints.moveTo(now.q, now.theta, now.force);
     control = &controlOf(settings);
-    control->setMemory(settings, kept.memory);
+    control->applySettings(settings);
+    setMemory(kept.memory);
+}
+
+void VRattleRun::setMemory(const Memory& memory) {
+    control->setMemory(memory);
+    control->setReferences(memory.references);
+    automatic.getControl().setMemory(memory.automatic);
 }
 
 template <class Change> void VRattleRun::attempt(const Change& change) {
@@ -48,7 +55,7 @@ void VRattleRun::adoptParameters() {
 }
 
 void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
-                       double energy, const ExpressionParameters& theta, const StepMemory& memory) {
+                       double energy, const ExpressionParameters& theta, const Memory& memory) {
     attempt([&] {
         now.theta = theta;
         takeOver(positions, velocities, forces, energy);
@@ -59,7 +66,18 @@ void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& veloci
     formHalfStepVelocities();
 }
 
-void VRattleRun::resume(const StepState& state, const StepMemory& memory) {
+// With S_c of begin().
+void VRattleRun::adopt(const Memory& memory) {
+    control->setMemory(memory);
+    if (!settings.isAutomatic)
+        return;
+    setReferences(memory.references);
+    AutomaticControl::Memory own = automatic.getControl().getMemory();
+    static_cast<AutomaticRecursions::AutomaticNumbers&>(own) = memory.automatic;
+    automatic.getControl().setMemory(own);
+}
+
+void VRattleRun::resume(const StepState& state, const Memory& memory) {
     attempt([&] {
         now.theta = state.theta;
         takeOver(state.q, state.v, state.force, state.groupEnergy);
@@ -67,6 +85,7 @@ void VRattleRun::resume(const StepState& state, const StepMemory& memory) {
     });
     StepState exact = state; // this has projected the velocities, which changes the last bits
     exact.rightSide = now.rightSide;
+    exact.forceParts = now.forceParts;
     putBack({settings, exact, solver.motion.target, memory});
 }
 
@@ -112,7 +131,7 @@ void VRattleRun::changeVelocities(const vector<Vec3>& velocities) {
     control->change(StepControl::Velocities, std::min(1.0, std::sqrt(part)));
 }
 
-void VRattleRun::changeForces(const vector<Vec3>& forces, double energy) {
+void VRattleRun::changeForces(vector<Vec3>& forces, double energy) {
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
     vector<Vec3>& change = solver.next.v;
     for (int i : constraints.getMovingParticles())
@@ -120,15 +139,27 @@ void VRattleRun::changeForces(const vector<Vec3>& forces, double energy) {
     const double changeSquared = constraints.sumOfSquares(change, inverseMasses);
     const double forceSquared =
         std::max(constraints.sumOfSquares(forces, inverseMasses), constraints.sumOfSquares(now.force, inverseMasses));
-    if (!std::isfinite(changeSquared))
-        throw StepFailure(constraints.explainForces(forces));
-    attempt([&] {
-        now.force = forces;
-        now.groupEnergy = energy;
+    const Memory memory = getMemory();
+    const vector<double> values = now.values, forceParts = now.forceParts;
+    auto exchange = [&] {
+        now.force.swap(forces);
+        std::swap(now.groupEnergy, energy);
+        now.lambda.swap(solver.next.lambda);
+        now.rightSide.swap(solver.next.rightSide);
         constraints.moveTo(now.q, now.theta, now.force);
+    };
+    exchange();
+    try {
         constraints.findMultipliers(now.v, now.theta, now.lambda, now.rightSide);
         control->change(StepControl::Forces, std::min(1.0, std::sqrt(changeSquared / (forceSquared + TINY))));
-    });
+    }
+    catch (...) {
+        exchange();
+        now.values = values;
+        now.forceParts = forceParts;
+        setMemory(memory);
+        throw;
+    }
     if (control->hasStarted())
         formHalfStepVelocities();
 }

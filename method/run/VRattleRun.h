@@ -7,6 +7,8 @@
 #include "openmm/Vec3.h"
 #include "step/VRattleDynamics.h"
 #include <functional>
+#include <map>
+#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -16,15 +18,75 @@ class VRattleRun : public VRattleDynamics {
 public:
     using VRattleDynamics::VRattleDynamics;
 
+    typedef ConstraintSolver::Parallel Parallel;
+
+    /** Let threads share the work where that is faster. Results do not depend on their number, to the last bit. */
+    void setParallel(const Parallel& parallel, int numThreads) {
+        constraints.setParallel(parallel, numThreads);
+    }
+    /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
+    template <class Task> void share(int count, const Task& task) {
+        constraints.share(count, task);
+    }
+
+    // ------------------------------------------------------------------------------------- what others see of the state
+
+    const ConstraintSystem& getConstraintSystem() const {
+        return constraints.getSystem();
+    }
+    const std::vector<OpenMM::Vec3>& getPositions() const {
+        return now.q;
+    }
+    const std::vector<OpenMM::Vec3>& getVelocities() const {
+        return now.v;
+    }
+    const std::vector<OpenMM::Vec3>& getForces() const {
+        return now.force;
+    }
+    double getGroupEnergy() const {
+        return now.groupEnergy;
+    }
+    /** theta[n], those in force, and the rates of the step that has led to them. */
+    const ExpressionParameters& getParameters() const {
+        return now.theta;
+    }
+    const std::vector<double>& getMultipliers() const {
+        return now.lambda;
+    }
+    /** rho[n-1/2]. */
+    double getDensity() const {
+        return control->getDensity();
+    }
+    std::vector<double> getMonitorValues() const {
+        return control->getValues();
+    }
+    /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
+    std::vector<double> getReferences() const {
+        return control->getReferences();
+    }
+    long long getNumIterations() const {
+        return solver.getNumIterations();
+    }
+    long long getNumRescues() const {
+        return control->getNumRescues();
+    }
+
+    // --------------------------------------------------------------------------------------------------------- memory
+
+    /** What the next step depends on beside settings and state. */
+    struct Memory : StepMemory {
+        std::vector<double> references;
+        AutomaticControl::Memory automatic = {}; // of automatic step control
+    };
     /** All that the next step depends on. */
     struct Kept {
         Settings settings;
         StepState state;
         std::vector<double> target; // of the parameters of expressions
-        StepMemory memory;
+        Memory memory;
     };
-    Kept keep() const {
-        return {settings, now, solver.motion.target, control->getMemory()};
+    Kept keep() {
+        return {settings, now, solver.motion.target, getMemory()};
     }
     /** Put back what was kept, to the last bit. */
     void putBack(const Kept& kept);
@@ -32,8 +94,25 @@ public:
     std::function<void()> remember() {
         return [this, kept = keep()] { putBack(kept); };
     }
-    StepMemory getMemory() const {
-        return control->getMemory();
+    Memory getMemory() {
+        return {control->getMemory(), control->getReferences(), automatic.getControl().getMemory()};
+    }
+
+    // ---------------------------------------------------------------------------------------------- starts and changes
+
+    /**
+     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
+     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
+     *
+     * @return whether the positions were changed
+     * @throws StepFailure    if there is no such configuration nearby
+     */
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions) {
+        return constraints.projectPositions(positions, now.theta);
+    }
+    /** Change the parameters of an expression: those that the next step leads to. */
+    void setParameters(int expression, const std::map<std::string, double>& parameters) {
+        getConstraintSystem().writeParameters(expression, parameters, solver.motion.target);
     }
     /** As its base does, but a failure leaves everything as it was. So does that of all that follows here. */
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
@@ -42,7 +121,7 @@ public:
      * Go on from a saved state as if nothing had happened: the following steps are the same to the last bit if the forces are. The
      * settings and the target are those there are, and K Lambda is found.
      */
-    void resume(const StepState& state, const StepMemory& memory);
+    void resume(const StepState& state, const Memory& memory);
     /**
      * Go on from an on-step state that somebody else's steps have led to, in the middle of a sequence of densities with the same
      * settings and references. The velocities are taken as they are; the half-step momentum is formed from them. Parameters that are
@@ -52,11 +131,9 @@ public:
      */
     void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const ExpressionParameters& theta,
-               const StepMemory& memory);
+               const Memory& memory);
     /** Take over what somebody else has carried on; the state is another. */
-    void adopt(const StepMemory& memory) {
-        control->adopt(memory);
-    }
+    void adopt(const Memory& memory);
     /** Put parameters that are set in force at once, before positions are projected and the run starts afresh with begin(). */
     void adoptParameters();
     /** Whether the next step and the last one are steps at the same parameters. */
@@ -69,14 +146,14 @@ public:
     }
     /** The 2K/f at which those of automatic step control were found. */
     void setReferenceTemperature(double kT) {
-        automatic.setReferenceTemperature(kT);
+        automatic.getControl().setReferenceTemperature(kT);
     }
     /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
     double findHalfStepValue() {
         return monitors.findHalfStepValue();
     }
     /** The state and the references of automatic step control. */
-    const AutomaticControl& getAutomaticControl() const {
+    const AutomaticControl& getAutomaticControl() {
         return automatic.getControl();
     }
 
@@ -97,12 +174,14 @@ public:
     /**
      * Go on with other forces at the same positions and velocities, since a parameter of a force has changed; as changeState().
      *
-     * @throws StepFailure    if they are not finite
+     * @param[in,out] forces    their storage is taken over, and other left in its place
+     * @throws StepFailure      if they are not finite
      */
-    void changeForces(const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
 private:
     template <class Change> void attempt(const Change& change);
+    void setMemory(const Memory& memory);
 };
 
 } // namespace OpenMMVRattle

@@ -11,9 +11,9 @@ using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
-AutomaticSteps::AutomaticSteps(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
+AutomaticSteps::AutomaticSteps(ConstraintSolver& constraints, StepSolver& solver, StepState& now) :
         StepControl(constraints, solver, now), control(constraints), isStartedNow(false), isJump(false), memoryBefore(),
-        forcesAhead(nullptr), blockSums(constraints.getSystem().getBlocks().size() - 1) {
+        forceSquares(constraints) {
 }
 
 AutomaticControl::State AutomaticSteps::stateOf(const StepState& state) {
@@ -39,7 +39,6 @@ bool AutomaticSteps::setSettings(const StepSettings& newSettings, bool isInForce
         return true;
     if (mustBegin)
         control.begin(stateOf(now));
-    takeValues();
     if (mustForget)
         forgetDensity();
     if (hasDensity)
@@ -57,6 +56,10 @@ void AutomaticSteps::applySettings(const StepSettings& newSettings) {
     control.setSettings(own);
 }
 
+vector<double> AutomaticSteps::getValues() const {
+    return {std::begin(control.getMemory().values), std::end(control.getMemory().values)};
+}
+
 vector<double> AutomaticSteps::getReferences() const {
     vector<double> inForce;
     for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++)
@@ -69,57 +72,17 @@ void AutomaticSteps::setReferences(const vector<double>& newReferences) {
         control.setReference((int) k, newReferences[k]);
 }
 
-StepMemory AutomaticSteps::getMemory() const {
-    StepMemory memory = *this;
-    memory.references = getReferences();
-    memory.automatic = control.getMemory();
-    memory.values.clear(); // which are those of the numbers
-    return memory;
-}
-
-void AutomaticSteps::setMemory(const StepSettings& newSettings, const StepMemory& memory) {
-    hasDensity = memory.hasDensity;
-    rho = memory.rho;
-    applySettings(newSettings);
-    setReferences(memory.references);
-    control.setMemory(memory.automatic);
-    takeValues();
-}
-
-void AutomaticSteps::takeValues() {
-    values.assign(std::begin(control.getMemory().values), std::end(control.getMemory().values));
-}
-
 // ------------------------------------------------------------------------------------------------- between two steps
-
-void AutomaticSteps::begin() {
-    forgetDensity();
-    requireFiniteForces(now.force);
-    control.begin(stateOf(now));
-    takeValues();
-}
-
-// With S_c of begin().
-void AutomaticSteps::adopt(const StepMemory& memory) {
-    AutomaticControl::Memory own = control.getMemory();
-    static_cast<AutomaticRecursions::AutomaticNumbers&>(own) = memory.automatic;
-    control.setMemory(own);
-    setReferences(memory.references);
-    takeValues();
-    hasDensity = true;
-    rho = memory.rho;
-}
 
 void AutomaticSteps::change(ChangeKind kind, double part) {
     const bool isPlace = kind == Everything || kind == Forces;
+    if (isPlace)
+        forceSquares.find(now.force);
     if (isPlace && !hasDensity) {
-        begin();
+        control.begin(stateOf(now));
         return;
     }
-    if (isPlace)
-        requireFiniteForces(now.force);
     control.change(stateOf(now), part);
-    takeValues();
     if (isPlace) // else the kick of the last step is in the half-step momentum
         rho = control.getLast();
 }
@@ -131,25 +94,11 @@ void AutomaticSteps::reverse() {
 
 // ------------------------------------------------------------------------------------------------------------- a step
 
-void AutomaticSteps::prepare() {
-    isStartedNow = isJump = false;
-    if (!hasDensity)
-        referencesBefore = getReferences();
-}
-
-bool AutomaticSteps::isVariable() const {
-    return hasDensity && !settings.isFixedStep;
-}
-
-// The densities start from their monitors at the end of the step.
-void AutomaticSteps::jump(const vector<Vec3>&, const ExpressionParameters&, bool isLarge) {
-    isJump = isLarge;
-}
-
 bool AutomaticSteps::start() {
     if (settings.isFixedStep)
         return false;
     memoryBefore = control.getMemory();
+    referencesBefore = getReferences();
     isStartedNow = true;
     control.start();
     hasDensity = true;
@@ -158,6 +107,8 @@ bool AutomaticSteps::start() {
 }
 
 void AutomaticSteps::solve() {
+    // The densities start from their monitors at the end of the step.
+    isJump = solver.jump > ParameterMotion::SMALL_JUMP && !settings.isFixedStep;
     rhoNext = settings.isFixedStep || !hasDensity ? 1.0 : control.getNext();
     if (hasDensity && !solver.solve(rho, rhoNext))
         throwNotConverged();
@@ -171,36 +122,14 @@ std::string AutomaticSteps::explainStep() const {
     return text.str();
 }
 
-ConstraintSolver::Observer* AutomaticSteps::observe(const ConstraintSolver::OnStep& end) {
-    forcesAhead = &end.forces;
-    return this;
-}
-
-// The force on a particle that does not move is of no interest, even if it is not a number.
-void AutomaticSteps::seeParticles(int block) {
-    const ConstraintSystem& system = constraints.getSystem();
-    double sum = 0;
-    for (int i = system.getBlocks()[block].particle; i < system.getBlocks()[block + 1].particle; i++)
-        if (system.getInverseMasses()[i] > 0)
-            sum += (*forcesAhead)[i].dot((*forcesAhead)[i]);
-    blockSums[block] = sum;
-}
-
-void AutomaticSteps::requireFiniteForces(const vector<Vec3>& forces) {
-    if (forcesAhead != &forces) {
-        forcesAhead = &forces;
-        for (size_t block = 0; block < blockSums.size(); block++)
-            seeParticles((int) block);
-    }
-    forcesAhead = nullptr;
-    for (double sum : blockSums)
-        if (!std::isfinite(sum))
-            throw StepFailure(constraints.explainForces(forces));
+ConstraintSolver::Observer* AutomaticSteps::observe(ConstraintSolver::OnStep& end) {
+    forceSquares.observe(end.forces);
+    return &forceSquares;
 }
 
 bool AutomaticSteps::measure() {
     const StepState& next = solver.next;
-    requireFiniteForces(next.force);
+    forceSquares.find(next.force);
     control.measure(stateOf(next), next.w, solver.size, now.force);
     return true;
 }
@@ -219,15 +148,14 @@ void AutomaticSteps::accept() {
         rho = rhoNext;
     if (hasDensity && isJump)
         control.change(stateOf(now), 1.0);
-    takeValues();
+    isStartedNow = false;
 }
 
 void AutomaticSteps::abandon() {
     if (isStartedNow) {
         control.setMemory(memoryBefore);
+        setReferences(referencesBefore);
         forgetDensity();
     }
     isStartedNow = false;
-    if (!hasDensity)
-        setReferences(referencesBefore);
 }

@@ -12,11 +12,22 @@ using std::vector;
 
 namespace {
 
+// What changes by more than this factor within the first step, or where the reference would be others by more, is not resolved.
+const double LARGEST_CHANGE = 2;
+// A density that differs by no more is the same.
+const double DENSITY_ROUNDING = 1e-12;
+// Of the scale of references: the other one to begin with, and what is left of the mismatch where it is found, or will do.
+const double FIRST_SCALE = 1.001, SCALE_ROUNDING = 1e-14, SCALE_TOLERANCE = 1e-6;
+const int MAX_SCALES = 20;
+
+bool isResolved(double value, double start) {
+    return value > start / LARGEST_CHANGE && value < start * LARGEST_CHANGE;
+}
+
 // The smooth sequence's value half a step after the start, from the values at the start, one step ahead and one back.
 double startValue(double start, double ahead, const double* back) {
     const double value = back != nullptr ? start + 0.25 * (ahead - *back) : 0.5 * (start + ahead);
-    // What changes by its own size within the first step is not resolved: take it as it is.
-    return value > 0.5 * start && value < 2 * start ? value : start;
+    return isResolved(value, start) ? value : start;
 }
 
 } // namespace
@@ -27,17 +38,7 @@ MonitorStart::MonitorStart(ConstraintSolver& constraints, StepSolver& solver, St
         hasBack(false), isCalm(false), triedDensity(1), firstDensity(0) {
 }
 
-void MonitorStart::prepare() {
-    if (firstDensity == 0)
-        referencesBefore = monitor.getReferences();
-}
-
-void MonitorStart::abandon() {
-    monitor.setReferences(referencesBefore);
-    forget();
-}
-
-double MonitorStart::findDensity(const vector<double>& values, double stepSize) {
+double MonitorStart::findDensity(double stepSize) {
     isCalm = false;
     if (firstDensity > 0)
         return firstDensity;
@@ -46,52 +47,52 @@ double MonitorStart::findDensity(const vector<double>& values, double stepSize) 
     for (int i : constraints.getMovingParticles())
         farthest = std::max(farthest, std::sqrt(now.q[i].dot(now.q[i])));
     const double speed = std::numeric_limits<double>::epsilon() * farthest / stepSize;
+    size_t numNegligible = 0, numKnown = 0;
     isNegligible.resize(terms.size());
-    bool areAllNegligible = true, areAllUnknown = true, areAllKnown = true;
     for (size_t k = 0; k < terms.size(); k++) {
-        isNegligible[k] = monitor.isNegligible((int) k, values[k], now, speed, speed / stepSize);
-        areAllNegligible = areAllNegligible && isNegligible[k];
         const bool isKnown = terms[k].reference > 0;
-        areAllUnknown = areAllUnknown && !isKnown;
-        areAllKnown = areAllKnown && isKnown;
+        isNegligible[k] = monitor.isNegligible(k, now, speed, speed / stepSize);
         isCalm = isCalm || (isNegligible[k] && !isKnown);
+        numNegligible += isNegligible[k];
+        numKnown += isKnown;
     }
+    const bool areAllNegligible = numNegligible == terms.size();
     isCalm = isCalm || areAllNegligible;
-    const bool isGiven = !areAllNegligible && !areAllUnknown && (areAllKnown || isCalm);
-    return triedDensity = isGiven ? monitor.combine(values) : 1.0;
+    const bool isGiven = !areAllNegligible && numKnown > 0 && (numKnown == terms.size() || isCalm);
+    return triedDensity = isGiven ? monitor.combine(now.values) : 1.0;
 }
 
-void MonitorStart::lookBack(const vector<double>& values, bool withHalfStep) {
+void MonitorStart::lookBack(bool withHalfStep) {
     if (isCalm)
         return;
     hasBack = lookBehind();
-    startValues = values;
+    startValues = now.values;
     if (!hasBack || !withHalfStep)
         return;
     // The mean of U_k(q0,p) over the half-step momenta on either side of the start, which is what (3.14) takes.
     const ExpressionParameters& theta = solver.motion.atStart(solver.size);
-    monitor.evaluateAt(now, solver.next.w, theta, startValues);
-    monitor.evaluateAt(now, back.w, theta, halfValues);
+    startValues = monitor.evaluateAt(now, solver.next.w, theta);
+    const vector<double>& behind = monitor.evaluateAt(now, back.w, theta);
     for (size_t k = 0; k < startValues.size(); k++)
-        startValues[k] = 0.5 * (startValues[k] + halfValues[k]);
+        startValues[k] = 0.5 * (startValues[k] + behind[k]);
 }
 
 // The state a step behind the start, if there is one.
 bool MonitorStart::lookBehind() {
     const StepState& next = solver.next;
+    const vector<double>& masses = constraints.getSystem().getMasses();
     back.q = now.q; // for the sake of particles without mass, which stay as they are
     back.w = back.v = now.v;
     if (!solver.solveBackwards(solver.size, back))
         return false;
-    const ConstraintSystem& system = constraints.getSystem();
     double product = 0, square = 0;
     for (int i : constraints.getMovingParticles()) {
         const Vec3 forward = next.q[i] - now.q[i];
-        product += system.getMasses()[i] * forward.dot(back.q[i] - now.q[i]);
-        square += system.getMasses()[i] * forward.dot(forward);
+        product += masses[i] * forward.dot(back.q[i] - now.q[i]);
+        square += masses[i] * forward.dot(forward);
     }
     const double alpha = square > 0 ? product / square : 0.0;
-    for (int i = 0; i < system.getNumParticles(); i++)
+    for (size_t i = 0; i < masses.size(); i++)
         back.force[i] = now.force[i] + (next.force[i] - now.force[i]) * alpha;
     back.groupEnergy = now.groupEnergy + alpha * (next.groupEnergy - now.groupEnergy);
     try {
@@ -99,8 +100,8 @@ bool MonitorStart::lookBehind() {
                                               back.v, back.lambda, back.rightSide, nullptr};
         monitor.observe(end);
         constraints.finish(end, &monitor);
-        monitor.evaluate(back, backValues);
-        monitor.requireValid(backValues);
+        monitor.evaluate(back);
+        monitor.requireValid(back.values);
     }
     catch (const StepFailure&) {
         return false;
@@ -108,57 +109,60 @@ bool MonitorStart::lookBehind() {
     return true;
 }
 
-bool MonitorStart::measure(const vector<double>& valuesNext) {
-    if (isCalm)
+bool MonitorStart::measure() {
+    if (isCalm || firstDensity > 0)
         return true;
-    const vector<StepMonitor::Term>& terms = monitor.getTerms();
-    const bool areAllTaken =
-        std::all_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return term.reference == 0; });
-    for (size_t k = 0; k < terms.size(); k++)
-        if (terms[k].reference == 0)
-            monitor.setReference((int) k,
-                                 startValue(startValues[k], valuesNext[k], hasBack ? &backValues[k] : nullptr));
-    if (areAllTaken) {
+    const vector<double>& ahead = solver.next.values;
+    referencesBefore = monitor.getReferences();
+    for (size_t k = 0; k < ahead.size(); k++)
+        if (referencesBefore[k] == 0)
+            monitor.setReference(k, startValue(startValues[k], ahead[k], hasBack ? &back.values[k] : nullptr));
+    if (std::count(referencesBefore.begin(), referencesBefore.end(), 0.0) == (int) ahead.size()) {
         if (hasBack)
-            scaleReferences(valuesNext);
+            scaleReferences();
         return true;
     }
-    if (firstDensity > 0)
-        return true;
-    const double behind = hasBack ? monitor.combine(backValues) : 0.0;
-    firstDensity = startValue(monitor.combine(startValues), monitor.combine(valuesNext), hasBack ? &behind : nullptr);
-    return std::fabs(firstDensity - triedDensity) <= 1e-12 * triedDensity;
+    const double behind = hasBack ? monitor.combine(back.values) : 0.0;
+    firstDensity = startValue(monitor.combine(startValues), monitor.combine(ahead), hasBack ? &behind : nullptr);
+    return std::fabs(firstDensity - triedDensity) <= DENSITY_ROUNDING * triedDensity;
 }
 
-bool MonitorStart::accept(const vector<double>& values) {
-    forget();
+bool MonitorStart::accept() {
+    firstDensity = 0;
+    const vector<double>& values = solver.next.values; // of the state before the step
     for (size_t k = 0; k < values.size() && isCalm; k++)
         if (monitor.getTerms()[k].reference == 0 && !isNegligible[k])
-            monitor.setReference((int) k, values[k]);
+            monitor.setReference(k, values[k]);
     return !isCalm;
+}
+
+void MonitorStart::abandon() {
+    if (firstDensity > 0)
+        monitor.setReferences(referencesBefore);
+    firstDensity = 0;
 }
 
 // With rho[1/2] = 1 the steps to either side have the size h, and not h/u0, so that the change of u over a step of the
 // sequence is theirs over u0. Scale the references such that u0 + (u1 - u-1)/(4 u0) = 1.
-void MonitorStart::scaleReferences(const vector<double>& valuesNext) {
+void MonitorStart::scaleReferences() {
     const vector<double> references = monitor.getReferences();
     auto mismatchOf = [&](double scale) {
         for (size_t k = 0; k < references.size(); k++)
-            monitor.setReference((int) k, scale * references[k]);
+            monitor.setReference(k, scale * references[k]);
         const double start = monitor.combine(startValues);
-        return start + 0.25 * (monitor.combine(valuesNext) - monitor.combine(backValues)) / start - 1;
+        return start + 0.25 * (monitor.combine(solver.next.values) - monitor.combine(back.values)) / start - 1;
     };
-    double last = 1, scale = 1.001, lastMismatch = mismatchOf(last);
-    for (int iteration = 0; iteration < 20; iteration++) { // the secant method
+    double last = 1, scale = FIRST_SCALE, lastMismatch = mismatchOf(last);
+    for (int iteration = 0; iteration < MAX_SCALES; iteration++) { // the secant method
         const double mismatch = mismatchOf(scale);
         const double next = scale - mismatch * (scale - last) / (mismatch - lastMismatch);
-        if (std::fabs(mismatch) < 1e-14 || !(next > 0.5 && next < 2))
+        if (std::fabs(mismatch) < SCALE_ROUNDING || !isResolved(next, 1))
             break;
         last = scale;
         lastMismatch = mismatch;
         scale = next;
     }
     // Where the monitor is not resolved the scale is left alone.
-    if (!(std::fabs(mismatchOf(scale)) < 1e-6))
+    if (!(std::fabs(mismatchOf(scale)) < SCALE_TOLERANCE))
         mismatchOf(1);
 }

@@ -29,30 +29,24 @@ namespace OpenMMVRattle {
 class MonitorStart {
 public:
     MonitorStart(ConstraintSolver& constraints, StepSolver& solver, StepMonitor& monitor, const StepState& now);
-    /** A first step is coming. */
-    void prepare();
-    /** It has failed: the references are those before it. */
-    void abandon();
-    /** It was of another state. */
-    void forget() {
-        firstDensity = 0;
-    }
-    /** rho[1/2] to be tried, where the monitors have these values at the start. */
-    double findDensity(const std::vector<double>& values, double stepSize);
+    /** rho[1/2] to be tried. */
+    double findDensity(double stepSize);
     /**
      * The end of the step that was tried is known, but for the velocities there.
      *
      * @param withHalfStep    whether the density is that of (3.14)
      */
-    void lookBack(const std::vector<double>& values, bool withHalfStep);
+    void lookBack(bool withHalfStep);
     /** The values there are known too. Returns whether the step stands; if not, it is to be taken again. */
-    bool measure(const std::vector<double>& valuesNext);
+    bool measure();
     /** It stands; returns whether a sequence has started. */
-    bool accept(const std::vector<double>& values);
+    bool accept();
+    /** It has failed: the references are those before it. */
+    void abandon();
 
 private:
     bool lookBehind();
-    void scaleReferences(const std::vector<double>& valuesNext);
+    void scaleReferences();
     ConstraintSolver& constraints;
     StepSolver& solver;
     StepMonitor& monitor;
@@ -62,7 +56,7 @@ private:
     bool isCalm; // whether the first step is one that starts no sequence
     double triedDensity, firstDensity; // the latter once it is known; else 0
     std::vector<char> isNegligible; // each monitor
-    std::vector<double> referencesBefore, backValues, startValues, halfValues;
+    std::vector<double> referencesBefore, startValues;
 };
 
 } // namespace OpenMMVRattle

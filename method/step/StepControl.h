@@ -28,16 +28,14 @@ struct StepSettings {
     int calibrationSteps = 1; // how many steps the references are found from
 };
 
-/** What the density of the next step depends on, beside the settings and the state. */
+/** What the density of the next step depends on, beside settings, references and the state. */
 struct StepMemory {
     bool hasDensity = false; // else the next step is the first one
     double rho = 1; // rho[n-1/2]
-    std::vector<double> values, references; // U_k(q[n],p[n]); U_k,ref in force
-    double u = 1, halfStepValue = 0; // u(q[n],p[n]), u(q[n],p[n-1/2])
+    // Of monitors: u(q[n],p[n-1/2]), if it is known; and for speed alone the change of u along F - G^T Lambda, and what (3.14) and
+    // (3.15) differed by in the last step.
     bool hasHalfStepValue = false;
-    double rate = 0; // the change of u along F - G^T Lambda; only the speed of convergence depends on it
-    double densityOffset = 0; // what (3.14) and (3.15) differed by in the last step
-    AutomaticControl::Memory automatic; // of automatic step control
+    double halfStepValue = 0, rate = 0, densityOffset = 0;
 };
 
 /**
@@ -48,8 +46,7 @@ class StepControl : protected StepMemory {
 public:
     /** What has been changed between two steps. */
     enum ChangeKind { Everything, Forces, Velocities, Frame };
-
-    StepControl(ConstraintSolver& constraints, StepSolver& solver, const StepState& now) :
+    StepControl(ConstraintSolver& constraints, StepSolver& solver, StepState& now) :
             constraints(constraints), solver(solver), now(now), settings(), rhoNext(1) {
     }
     virtual ~StepControl() = default;
@@ -63,15 +60,21 @@ public:
     double getNextDensity() const {
         return rhoNext;
     }
-    const std::vector<double>& getValues() const {
-        return values;
-    }
-    /** U_k,ref, 0 while it is not known */
+    /** U_k[n], and U_k,ref, 0 while it is not known */
+    virtual std::vector<double> getValues() const = 0;
     virtual std::vector<double> getReferences() const = 0;
     virtual void setReferences(const std::vector<double>& references) = 0;
     virtual long long getNumRescues() const {
         return 0;
     }
+    const StepMemory& getMemory() const {
+        return *this;
+    }
+    void setMemory(const StepMemory& memory) {
+        static_cast<StepMemory&>(*this) = memory;
+    }
+    /** Take over settings and nothing else: where memory and references are those that belong to them. */
+    virtual void applySettings(const StepSettings& newSettings) = 0;
     /**
      * Take over settings. Where there is a state, the densities go on from there if the new settings allow it.
      *
@@ -79,17 +82,12 @@ public:
      * @return whether everything goes on as if nothing had happened; if not, the half-step momentum is formed anew
      */
     virtual bool setSettings(const StepSettings& newSettings, bool isInForce) = 0;
-    virtual StepMemory getMemory() const = 0;
-    virtual void setMemory(const StepSettings& newSettings, const StepMemory& memory) = 0;
 
-    /**
-     * The state is one that no step has led to: there is no density.
-     *
-     * @throws StepFailure    if a monitor is not defined there
-     */
-    virtual void begin() = 0;
-    /** After that: go on in the middle of a sequence that somebody else's steps have led to, with what the memory has of it. */
-    virtual void adopt(const StepMemory& memory) = 0;
+    /** The state is one that no step has led to: there is no density. Fails as change() does. */
+    void begin() {
+        forgetDensity();
+        change(Everything, 1.0);
+    }
     /**
      * The state has changed between two steps. But for a change of the velocities the half-step momentum is formed anew afterwards.
      *
@@ -100,12 +98,6 @@ public:
     /** Turn time around, where solve() has found the step that would have come, and the half-step momentum is its already. */
     virtual void reverse() = 0;
 
-    /** A step is coming. */
-    virtual void prepare() = 0;
-    /** Whether it depends on the monitors at all. */
-    virtual bool isVariable() const = 0;
-    /** The velocities will jump to these in the step, since parameters of expressions begin to move, or stop. */
-    virtual void jump(const std::vector<OpenMM::Vec3>& velocities, const ExpressionParameters& theta, bool isLarge) = 0;
     /** Where there is no sequence of densities yet, start one without looking ahead; returns whether that is done. */
     virtual bool start() {
         return false;
@@ -120,12 +112,8 @@ public:
     [[noreturn]] void throwNotConverged() {
         throw StepFailure(solver.explainFailure() + explainStep());
     }
-    /** The forces at the end of the step in progress are known: where to put the multipliers at half-step velocities, or null. */
-    virtual ConstraintSolver::HalfStep* lookBack() {
-        return nullptr;
-    }
-    /** What is to be done along with the solution there. */
-    virtual ConstraintSolver::Observer* observe(const ConstraintSolver::OnStep& end) = 0;
+    /** The forces at the end of the step in progress are known: what is to be done along with the solution there, or found with it. */
+    virtual ConstraintSolver::Observer* observe(ConstraintSolver::OnStep& end) = 0;
     /**
      * Look at the end of the step; nothing is taken over.
      *
@@ -133,7 +121,7 @@ public:
      * @throws StepFailure    if a monitor is not defined there
      */
     virtual bool measure() = 0;
-    /** Take over what has been measured: the state is that of the end now. */
+    /** Take over what has been measured: the state is that of the end now, and the one before is what was next. */
     virtual void accept() = 0;
     /** Or the step has failed. */
     virtual void abandon() = 0;
@@ -147,7 +135,7 @@ protected:
     }
     ConstraintSolver& constraints;
     StepSolver& solver;
-    const StepState& now;
+    StepState& now;
     StepSettings settings;
     double rhoNext; // rho[n+1/2]
 };

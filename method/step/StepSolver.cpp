@@ -33,9 +33,10 @@ double dot(const vector<double>& a, const vector<double>& b) {
 } // namespace
 
 StepSolver::StepSolver(ConstraintSolver& constraints, const StepState& now) :
-        motion(constraints.getSystem()), next(constraints.getSystem()), kind(First), size(0), constraints(constraints),
-        now(now), h(0), tolerance(0), isFromOnStep(false), lastDrift(0), correction(next.lambda), coupling(next.lambda),
-        response(next.lambda), gradient(next.q), halfStepChange(next.q), numNewtonIterations(0) {
+        motion(constraints.getSystem()), jump(-1), next(constraints.getSystem()), kind(First), size(0),
+        constraints(constraints), now(now), h(0), tolerance(0), isFromOnStep(false), lastDrift(0),
+        correction(next.lambda), coupling(next.lambda), response(next.lambda), gradient(next.q), halfStepChange(next.q),
+        numNewtonIterations(0) {
 }
 
 void StepSolver::setSettings(double stepSize, double newTolerance) {
@@ -47,6 +48,11 @@ void StepSolver::setSettings(double stepSize, double newTolerance) {
 void StepSolver::prepare() {
     motion.prepare(now.q, now.theta);
     next.theta.values = motion.target;
+    jump = -1;
+}
+
+void StepSolver::findJump(double rho) {
+    jump = motion.findJump(constraints, now.v, now.theta, h / rho, next.v);
 }
 
 ConstraintSolver::Trial StepSolver::trialTo(double kick, double drift, const vector<Vec3>& start) {
@@ -113,9 +119,7 @@ bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equat
         const ConstraintSolver::Guess start = regularGuess();
         const double constraintError = constraints.coupledPass(trial, monitor.observeTrial(motion.atStart(trial.drift)),
                                                                pass == 0 ? &start : nullptr, &monitor);
-        monitor.evaluateTrial(now, next.w, values);
-        const double uPlus = monitor.combine(values);
-        const double mismatch = rhoNext - uPlus + equation.known;
+        const double mismatch = rhoNext - monitor.combine(monitor.evaluateTrial(now, next.w)) + equation.known;
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       std::fabs(mismatch) / ((rhoNext + rho) * densityTolerance));
         if (pass > 0 && error <= 1)
@@ -143,10 +147,8 @@ bool StepSolver::solveByNewton(StepMonitor& monitor, const DensityEquation& equa
             constraints.guess(trial, regularGuess());
         const double constraintError = constraints.evaluate(trial);
         const ExpressionParameters& theta = motion.atStart(drift);
-        monitor.evaluateAt(now, next.w, theta, values);
-        const double uPlus = monitor.combine(values);
         // F_rho of docs/method.md, section 8
-        const double mismatch = rhoNext - uPlus + equation.known;
+        const double mismatch = rhoNext - monitor.combine(monitor.evaluateAt(now, next.w, theta)) + equation.known;
         const double relativeMismatch = std::fabs(mismatch) / (rhoNext + rho);
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       relativeMismatch / std::max(REGULAR_MARGIN * tolerance, DENSITY_ROUNDING));
@@ -160,7 +162,7 @@ bool StepSolver::solveByNewton(StepMonitor& monitor, const DensityEquation& equa
         if (!constraints.linearize(trial))
             return false;
         // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-        monitor.evaluateGradient(theta, next.w, values, gradient);
+        monitor.evaluateGradient(now, next.w, theta, gradient);
         constraints.multiplyOverMass(gradient, coupling);
         for (double& a : coupling)
             a *= kick;

@@ -28,6 +28,10 @@ public:
     /** A step is coming, which may move parameters of expressions. */
     void prepare();
     ParameterMotion motion;
+    /** Find whether the velocities jump in it, after one of density rho, as they do where parameters begin to move, or stop. */
+    void findJump(double rho);
+    double
+        jump; // the part of the kinetic energy that is in it; then next has the new velocities. Negative if there is none
     /** Solve (3.9)-(3.11) for a regular step, from p[n-1/2] and rho = rho[n-1/2]; returns whether that is done. */
     bool solve(double rho, double rhoNext);
     /** The same for a step of plain RATTLE from the on-step state. */
@@ -36,10 +40,10 @@ public:
     bool solveBackwards(double stepSize, StepState& back);
     /** What (3.14) needs that does not change in a step. */
     struct DensityEquation {
-        double rho, known;            // rho[n-1/2]; rho - u(q,p-)
+        double rho, known; // rho[n-1/2]; rho - u(q,p-)
         double explicitValue, offset; // the rho+ of (3.15), and what it lacked in the last step
-        double rate;                  // of u along F - G^T Lambda
-        double fallBack;              // a rho+ to begin with where that of (3.15) is not positive
+        double rate; // of u along F - G^T Lambda
+        double fallBack; // a rho+ to begin with where that of (3.15) is not positive
     };
     /** Solve (3.9)-(3.11) and (3.14) together, by chord iterations and where these fail by Newton's; rhoNext is found too. */
     bool solve(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
@@ -66,7 +70,7 @@ private:
     double h, tolerance;
     bool isFromOnStep;
     double lastDrift; // of the last trial
-    std::vector<double> values, correction, coupling, response;
+    std::vector<double> correction, coupling, response;
     std::vector<OpenMM::Vec3> gradient, halfStepChange;
     long long numNewtonIterations; // those of (3.14)
 };

@@ -21,6 +21,7 @@ struct StepState {
     std::vector<double> lambda, rightSide;    // Lambda(q[n],p[n]) and K Lambda
     ConstraintSolver::Offset offset;          // lambda and Lambda of the last regular step
     double groupEnergy = 0;                   // of the monitor's force group at q[n]
+    std::vector<double> values, forceParts;   // U_k(q[n],p[n]), and what of each the forces alone are
 };
 
 } // namespace OpenMMVRattle

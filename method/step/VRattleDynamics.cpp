@@ -12,8 +12,6 @@ namespace {
 
 // A step asked to end at a given time may be longer than the density says by this fraction, so that no sliver is left.
 const double SLIVER = 1e-6;
-// The part of the kinetic energy in a jump of the velocities that starts no oscillation to speak of.
-const double SMALL_JUMP_OF_ENERGY = 1e-4;
 
 } // namespace
 
@@ -66,28 +64,18 @@ void VRattleDynamics::takeOver(const vector<Vec3>& positions, const vector<Vec3>
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
 void VRattleDynamics::formHalfStepVelocities() {
     const double kick = 0.5 * settings.stepSize / control->getDensity();
-    const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
+    const vector<double>& inverseMasses = constraints.getSystem().getInverseMasses();
     for (int i : constraints.getMovingParticles())
         now.w[i] = now.v[i] - now.force[i] * (kick * inverseMasses[i]);
     constraints.addTransposedOverMass(now.lambda, kick, now.w);
 }
 
-void VRattleDynamics::prepareStep() {
-    solver.prepare();
-    control->prepare();
-}
-
 double VRattleDynamics::step(double maxStep) {
     constraints.beginStep();
-    prepareStep();
-    if (control->isVariable()) {
-        vector<Vec3>& velocities = solver.next.v;
-        const double part = solver.motion.findJump(constraints, now.v, now.theta,
-                                                   settings.stepSize / control->getDensity(), velocities);
-        if (part >= 0)
-            control->jump(velocities, solver.motion.getJump(), part > SMALL_JUMP_OF_ENERGY);
-    }
-    if (!control->hasStarted() && control->start())
+    solver.prepare();
+    if (control->hasStarted())
+        solver.findJump(control->getDensity());
+    else if (control->start())
         formHalfStepVelocities();
     solver.kind = control->hasStarted() ? StepSolver::Regular : StepSolver::First;
     control->solve(); // (3.9)-(3.11), (3.14)
@@ -108,9 +96,8 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     StepState& next = solver.next;
     next.force.swap(forces);
     next.groupEnergy = energy;
-    ConstraintSolver::HalfStep* atHalfStep = control->lookBack();
-    const ConstraintSolver::OnStep end = {next.q, next.w,      next.force,     next.theta, 0.5 * solver.size,
-                                          next.v, next.lambda, next.rightSide, atHalfStep};
+    ConstraintSolver::OnStep end = {next.q, next.w,      next.force,     next.theta, 0.5 * solver.size,
+                                    next.v, next.lambda, next.rightSide, nullptr};
     constraints.finish(end, control->observe(end)); // (3.12)-(3.13)
     if (!control->measure())
         return false;
@@ -127,7 +114,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
 // The step that would have come leads from where it leads to back to here.
 void VRattleDynamics::reverse() {
     if (control->hasStarted()) {
-        prepareStep();
+        solver.prepare();
         control->solve();
         now.offset.found.swap(solver.next.offset.found);
         now.offset.expected = now.lambda;

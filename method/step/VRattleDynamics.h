@@ -10,8 +10,6 @@
 #include "step/MonitorControl.h"
 #include "step/StepSolver.h"
 #include "step/StepState.h"
-#include <map>
-#include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -27,40 +25,19 @@ namespace OpenMMVRattle {
  *     dynamics.finish(forces, groupEnergy);    // (3.12)-(3.13): new on-step velocities; the step is complete
  *
  * Until finish() has returned, the state before the step is untouched. Momenta are kept as velocities: v stands for
- * M^-1 p[n], w for M^-1 p[n-1/2]. What others do to the state between two steps: VRattleRun (method/run).
+ * M^-1 p[n], w for M^-1 p[n-1/2]. What others see of the state and do to it between two steps: VRattleRun (method/run).
  */
 class VRattleDynamics {
 public:
-    typedef ConstraintSolver::Parallel Parallel;
     typedef StepSettings Settings;
 
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
-
-    /** Let threads share the work where that is faster. Results do not depend on their number, to the last bit. */
-    void setParallel(const Parallel& parallel, int numThreads) {
-        constraints.setParallel(parallel, numThreads);
-    }
-    /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
-    template <class Task> void share(int count, const Task& task) {
-        constraints.share(count, task);
-    }
     /**
      * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
      * half-step momentum is formed anew.
      */
     void setSettings(const Settings& newSettings);
-
-    /**
-     * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
-     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
-     *
-     * @return whether the positions were changed
-     * @throws StepFailure    if there is no such configuration nearby
-     */
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions) {
-        return constraints.projectPositions(positions, now.theta);
-    }
     /**
      * Start afresh at a state. The velocities are projected onto the constraints, whose parameters, those in force, are at rest
      * and stay so until others are set.
@@ -70,26 +47,18 @@ public:
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     /**
-     * Change the parameters of an expression: the next step leads to positions that satisfy the constraint with these, in that
-     * its position equation is g(q[n+1]; theta[n+1]) = 0 (3.11), and the velocities at its end
-     * G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
-     */
-    void setParameters(int expression, const std::map<std::string, double>& parameters) {
-        getConstraintSystem().writeParameters(expression, parameters, solver.motion.target);
-    }
-    /** theta[n], those in force, and the rates of the step that has led to them. */
-    const ExpressionParameters& getParameters() const {
-        return now.theta;
-    }
-
-    /**
-     * The first half of a step.
+     * The first half of a step. It leads to the parameters of expressions that have been set: g(q[n+1]; theta[n+1]) = 0 (3.11), and at
+     * its end G v + (dg/dtheta) (theta[n+1] - theta[n])/dt = 0 (3.13).
      *
      * @param maxStep    the step must not be longer than this (ps); a shortened step goes on with the same density
      * @return the size of the step (ps)
      * @throws StepFailure    if the equations of the step have no solution that the iteration finds
      */
     double step(double maxStep);
+    /** q[n+1], after that. */
+    const std::vector<OpenMM::Vec3>& getNextPositions() const {
+        return solver.next.q;
+    }
     /**
      * The second half of a step.
      *
@@ -109,49 +78,9 @@ public:
     }
     /** Turn time around, without a force. */
     void reverse();
-
     /** Whether the next step continues a sequence of densities; if not, it is the first one. */
     bool hasStarted() const {
         return control->hasStarted();
-    }
-    const ConstraintSystem& getConstraintSystem() const {
-        return constraints.getSystem();
-    }
-    const std::vector<OpenMM::Vec3>& getPositions() const {
-        return now.q;
-    }
-    /** q[n+1], after step(). */
-    const std::vector<OpenMM::Vec3>& getNextPositions() const {
-        return solver.next.q;
-    }
-    const std::vector<OpenMM::Vec3>& getVelocities() const {
-        return now.v;
-    }
-    const std::vector<OpenMM::Vec3>& getForces() const {
-        return now.force;
-    }
-    double getGroupEnergy() const {
-        return now.groupEnergy;
-    }
-    /** rho[n-1/2]. */
-    double getDensity() const {
-        return control->getDensity();
-    }
-    const std::vector<double>& getMonitorValues() const {
-        return control->getValues();
-    }
-    /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
-    std::vector<double> getReferences() const {
-        return control->getReferences();
-    }
-    const std::vector<double>& getMultipliers() const {
-        return now.lambda;
-    }
-    long long getNumIterations() const {
-        return solver.getNumIterations();
-    }
-    long long getNumRescues() const {
-        return control->getNumRescues();
     }
 
 protected:
@@ -167,9 +96,6 @@ protected:
     AutomaticSteps automatic;
     StepControl* control; // the one in force
     Settings settings;
-
-private:
-    void prepareStep();
 };
 
 } // namespace OpenMMVRattle

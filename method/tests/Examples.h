@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_EXAMPLES_H_
 #define OPENMMVRATTLE_EXAMPLES_H_
 
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <algorithm>
 #include <cmath>
 #include <functional>
@@ -134,7 +134,7 @@ inline std::vector<OpenMM::Vec3> forcesAt(const std::vector<OpenMM::Vec3>& posit
 }
 
 /** Whole steps in that field. */
-inline void takeSteps(VRattleDynamics& dynamics, int steps) {
+inline void takeSteps(VRattleRun& dynamics, int steps) {
     for (int i = 0; i < steps; i++) {
         std::vector<OpenMM::Vec3> forces;
         do {

@@ -57,8 +57,8 @@ static Example makeExample() {
     return e;
 }
 
-void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int numThreads) {
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+void testSteps(const Example& e, const VRattleRun::Settings& settings, int numThreads) {
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
     int calls = 0;
     dynamics.setParallel(runInReverse(numThreads, calls), numThreads);
@@ -81,11 +81,11 @@ void testSteps(const Example& e, const VRattleDynamics::Settings& settings, int 
 int main() {
     const Example e = makeExample();
     auto make = [](StepDensity::Update update) {
-        return VRattleDynamics::Settings{
+        return VRattleRun::Settings{
             0.001, 0.001 / 50, 0.002, 1e-8, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false};
     };
-    const VRattleDynamics::Settings automatic = {0.001, 0,     0,    1e-8,       StepDensity::SemiExplicit,
-                                                 {},    false, true, {1e4, 1e4}, 0};
+    const VRattleRun::Settings automatic = {0.001, 0,     0,    1e-8,       StepDensity::SemiExplicit,
+                                            {},    false, true, {1e4, 1e4}, 0};
     TestList tests;
     for (int numThreads : {1, 2}) {
         const std::string threads = std::to_string(numThreads) + (numThreads == 1 ? " thread" : " threads");

@@ -6,7 +6,7 @@
 #include "TestSupport.h"
 #include "constraints/ConstraintMatrix.h"
 #include "constraints/NewtonMatrix.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <Eigen/Dense>
 #include <random>
 #include <string>
@@ -231,7 +231,7 @@ void testClustersOfDifferentLengths() {
         addMolecule({{0, 1}, {0, 2}, {1, 2}}, 3);
         addMolecule({{0, 1}, {0, 2}, {0, 3}}, 4);
     }
-    VRattleDynamics dynamics(e.masses, e.constraints);
+    VRattleRun dynamics(e.masses, e.constraints);
     const ConstraintSystem& system = dynamics.getConstraintSystem();
     const ExpressionParameters theta = system.getGivenParameters();
     const int m = system.getNumConstraints();

@@ -6,7 +6,7 @@
 #include "Examples.h"
 #include "TestSupport.h"
 #include "constraints/NewtonMatrix.h"
-#include "step/VRattleDynamics.h"
+#include "run/VRattleRun.h"
 #include <Eigen/Dense>
 #include <cmath>
 
@@ -19,7 +19,7 @@ namespace {
 
 const string DISTANCE = "sqrt((x1-x2)^2+(y1-y2)^2+(z1-z2)^2)";
 
-VRattleDynamics::Settings fixedSteps(double stepSize) {
+VRattleRun::Settings fixedSteps(double stepSize) {
     return {stepSize, 0, 0, 1e-8, StepDensity::Explicit, {}, false};
 }
 
@@ -44,7 +44,7 @@ void testProjectionOfChain(int bonds) {
             vector<Vec3> reference;
             for (const char* scale : {"1", "1e-8", "1e12"}) {
                 const Example e = makeChain(bonds, scale, noise, seed);
-                VRattleDynamics dynamics(e.masses, {}, e.expressions);
+                VRattleRun dynamics(e.masses, {}, e.expressions);
                 dynamics.setSettings(fixedSteps(1e-3));
                 vector<Vec3> positions = e.positions;
                 ASSERT(dynamics.projectPositions(positions));
@@ -101,7 +101,7 @@ void testScalesOfNewtonMatrix(int bonds) {
 void testLargeStep() {
     for (const char* scale : {"1", "1e-8", "1e12"}) {
         const Example e = makeChain(24, scale, 0.0, 1);
-        VRattleDynamics dynamics(e.masses, {}, e.expressions);
+        VRattleRun dynamics(e.masses, {}, e.expressions);
         dynamics.setSettings(fixedSteps(0.05));
         vector<Vec3> velocities(e.masses.size());
         for (size_t i = 0; i < velocities.size(); i++)
@@ -136,14 +136,14 @@ void testDihedralOverLine() {
          {}});
     // Through the line within one step: the angle, which is 0, would be pi behind it.
     const vector<Vec3> velocities = {Vec3(0, -1, 0), Vec3(), Vec3(), Vec3()};
-    VRattleDynamics dynamics(e.masses, {}, e.expressions);
+    VRattleRun dynamics(e.masses, {}, e.expressions);
     dynamics.setSettings(fixedSteps(2e-3));
     dynamics.begin(e.positions, velocities, vector<Vec3>(4), 0);
     assertThrows("expression constraint 3 (atan2", [&] { dynamics.step(INFINITY); });
     assertThrows("singular geometry", [&] { dynamics.step(INFINITY); });
     // A step that is simply too large blames nobody's geometry.
     const Example chain = makeChain(3, "1", 0.0, 1);
-    VRattleDynamics other(chain.masses, {}, chain.expressions);
+    VRattleRun other(chain.masses, {}, chain.expressions);
     other.setSettings(fixedSteps(10.0));
     other.begin(chain.positions, {Vec3(0, 1, 0), Vec3(0, -1, 0), Vec3(0, 1, 2), Vec3(0, -1, 0)}, vector<Vec3>(4), 0);
     assertThrows("could not be solved for", [&] { other.step(INFINITY); });

@@ -214,12 +214,12 @@ void testNewtonMatrix(const Example& e) {
     ASSERT((a * numbers(x) - numbers(b)).norm() <= 1e-9 * numbers(b).norm());
 }
 
-static VRattleDynamics::Settings makeSettings(StepDensity::Update update) {
+static VRattleRun::Settings makeSettings(StepDensity::Update update) {
     return {0.002, 0.002 / 50, 0.004, 1e-10, update, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false};
 }
 
 void testSteps(const Example& e, StepDensity::Update update) {
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     dynamics.setSettings(makeSettings(update));
     vector<Vec3> start = e.positions;
     dynamics.begin(start, e.velocities, forcesAt(start), 0);
@@ -259,7 +259,7 @@ void testSteps(const Example& e, StepDensity::Update update) {
 
 // Positions that are off by up to a hundredth of a bond come back.
 void testProjection(const Example& e) {
-    VRattleDynamics dynamics(e.masses, e.distances, e.expressions);
+    VRattleRun dynamics(e.masses, e.distances, e.expressions);
     dynamics.setSettings(makeSettings(StepDensity::Explicit));
     const ConstraintSystem& system = dynamics.getConstraintSystem();
     const ExpressionParameters theta = system.getGivenParameters();
@@ -282,7 +282,7 @@ void testDependentConstraints(const Example& e) {
     for (int k : {whole.getPieces()[1].first, whole.getCutClusters()[0].joints.first}) {
         vector<DistanceConstraint> distances = e.distances;
         distances.push_back(whole.getConstraint(k));
-        VRattleDynamics dynamics(e.masses, distances, e.expressions);
+        VRattleRun dynamics(e.masses, distances, e.expressions);
         ASSERT(!dynamics.getConstraintSystem().getPieces().empty());
         dynamics.setSettings(makeSettings(StepDensity::Explicit));
         assertThrows("redundant", [&] { dynamics.begin(e.positions, e.velocities, vector<Vec3>(e.masses.size()), 0); });

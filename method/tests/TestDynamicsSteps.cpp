@@ -1,7 +1,7 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// VRattleDynamics with forces of its own: clusters of every shape that has kernels, in odd and even numbers, beside
+// VRattleRun with forces of its own: clusters of every shape that has kernels, in odd and even numbers, beside
 // general ones, against a dense statement of the multipliers.
 
 #include "Examples.h"

@@ -261,7 +261,7 @@ void testStar() {
         const Vec3 r = e.randomVector(1);
         e.join(0, e.add(50, r * (1 / std::sqrt(r.dot(r)))));
     }
-    VRattleDynamics dynamics(e.masses, e.distances);
+    VRattleRun dynamics(e.masses, e.distances);
     dynamics.setSettings(
         {1e-3, 0, 0, 1e-10, StepDensity::SemiExplicit, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false});
     const vector<Vec3> forces = forcesAt(e.positions);

@@ -54,7 +54,7 @@ DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
 
 DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
     const double halfStepValue = settings.isAutomatic ? 0.0 : vrattle.findHalfStepValue();
-    const StepMemory memory = vrattle.getMemory();
+    const VRattleRun::Memory memory = vrattle.getMemory();
     DeviceSteps::State state = {memory.rho, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
     if (settings.isAutomatic) {
         state.automatic = memory.automatic;
@@ -63,8 +63,9 @@ DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
     return state;
 }
 
-StepMemory CommonVRattleDevice::memoryOf(const DeviceSteps::State& others) const {
-    StepMemory memory;
+VRattleRun::Memory CommonVRattleDevice::memoryOf(const DeviceSteps::State& others) {
+    VRattleRun::Memory memory = vrattle.getMemory();
+    memory.hasDensity = true;
     memory.rho = others.density;
     memory.densityOffset = others.densityOffset;
     memory.hasHalfStepValue = others.hasHalfStepValue;
@@ -86,7 +87,7 @@ void CommonVRattleDevice::carryOn(const DeviceSteps::State& others) {
 
 // What a CMMotionRemover takes away is nothing to speak of for automatic step control, which would have to look at all velocities again.
 bool CommonVRattleDevice::doesFrameMatter() {
-    return !settings.isAutomatic && StepProgram::usesSpeeds(settings.terms);
+    return !settings.isAutomatic && StepMonitor::useVelocities(settings.terms);
 }
 
 vector<double> CommonVRattleDevice::getReferences() {

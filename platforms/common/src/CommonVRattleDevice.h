@@ -29,7 +29,7 @@ protected:
     void adopt(const State& state, const DeviceSteps::State& others) override;
     void carryOn(const DeviceSteps::State& others) override;
     bool doesFrameMatter() override;
-    StepMemory memoryOf(const DeviceSteps::State& others) const;
+    VRattleRun::Memory memoryOf(const DeviceSteps::State& others);
 };
 
 } // namespace OpenMMVRattle

@@ -186,10 +186,10 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
                                  : StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
     vector<double> numbers(program->getNumSettings());
     numbers[Control::Nominal] = settings.stepSize;
-    numbers[Control::Smallest] = settings.density.getSmallest();
-    numbers[Control::Lower] = settings.density.getLower();
-    numbers[Control::Slope] = settings.density.getUpperSlope();
-    numbers[Control::Curve] = settings.density.getCurve();
+    numbers[Control::Smallest] = settings.density.smallest;
+    numbers[Control::Lower] = settings.density.lower;
+    numbers[Control::Slope] = settings.density.upperSlope;
+    numbers[Control::Curve] = settings.density.curve;
     numbers[Control::DensityTolerance] =
         std::max(MARGIN * settings.tolerance, isMixed ? DENSITY_TOLERANCE : SINGLE_DENSITY_TOLERANCE);
     numbers[Control::DensityRounding] = isMixed ? DENSITY_ROUNDING : SINGLE_DENSITY_ROUNDING;

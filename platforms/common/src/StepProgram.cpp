@@ -119,19 +119,6 @@ const map<StepMonitor::Kind, MonitorText> MONITORS = {
     {StepMonitor::MaxParticleArcLength, {{LargestArc}, "sqrt($0)"}},
     {StepMonitor::ForceGroupEnergy, {{}, "groupEnergy"}}};
 
-bool usesMultipliers(StepMonitor::Kind kind) {
-    const vector<Quantity>& quantities = MONITORS.at(kind).quantities;
-    return std::any_of(quantities.begin(), quantities.end(),
-                       [](Quantity quantity) { return QUANTITIES.at(quantity).ofConstraint; });
-}
-
-bool isOfSpeeds(StepMonitor::Kind kind) {
-    const vector<Quantity>& quantities = MONITORS.at(kind).quantities;
-    return std::any_of(quantities.begin(), quantities.end(), [](Quantity quantity) {
-        return quantity == KineticSquares || quantity == SpeedSquares || quantity == LargestArc;
-    });
-}
-
 } // namespace
 
 StepProgram::Update StepProgram::updateOf(const vector<StepMonitor::Term>& terms, bool isFixedStep,
@@ -140,14 +127,7 @@ StepProgram::Update StepProgram::updateOf(const vector<StepMonitor::Term>& terms
         return Fixed;
     if (update == StepDensity::Bounded)
         return Bounded;
-    const bool dependsOnVelocities = std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) {
-        return usesMultipliers(term.kind) || isOfSpeeds(term.kind);
-    });
-    return update == StepDensity::SemiExplicit && dependsOnVelocities ? SemiExplicit : Sum;
-}
-
-bool StepProgram::usesSpeeds(const vector<StepMonitor::Term>& terms) {
-    return std::any_of(terms.begin(), terms.end(), [](const StepMonitor::Term& term) { return isOfSpeeds(term.kind); });
+    return update == StepDensity::SemiExplicit && StepMonitor::dependOnVelocities(terms) ? SemiExplicit : Sum;
 }
 
 StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& large,

@@ -109,8 +109,6 @@ public:
     }
     /** The update as a device sees it: what does not depend on velocities needs no iteration. */
     static Update updateOf(const std::vector<StepMonitor::Term>& terms, bool isFixedStep, StepDensity::Update update);
-    /** Whether the monitors depend on the velocities themselves, and not through the multipliers alone. */
-    static bool usesSpeeds(const std::vector<StepMonitor::Term>& terms);
     const std::string& getSource() const {
         return source;
     }

@@ -233,7 +233,7 @@ struct Both {
         handOver();
     }
     void handOver() {
-        const StepMemory memory = dynamics.getMemory();
+        const VRattleRun::Memory memory = dynamics.getMemory();
         const double energy = groupEnergyAt(dynamics.getPositions());
         computeForces();
         context.setVelocities(dynamics.getVelocities());
