@@ -40,6 +40,8 @@ public:
     /** Take note that parameters of Forces have changed: the next step goes on with their forces, which cost one more evaluation. */
     void forcesChanged();
 
+    /** Go on from what resume() was given, if the Context is still in that state. Before a step this comes by itself. */
+    void takeSaved();
     void step(int count);
     void stepTo(double time);
     void reverse();
@@ -94,7 +96,6 @@ private:
     void takeSettings();
     void takeForcesOfOthers();
     void takeParameters();
-    void takeSaved();
     void prepare(bool areForcesInvalid, bool isForStep = false);
     void findTask(bool areForcesInvalid, bool isForStep);
     void fulfilTask();

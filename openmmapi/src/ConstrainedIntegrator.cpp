@@ -262,8 +262,26 @@ IntegratorRun& ConstrainedIntegrator::requireRun() const {
     return *run;
 }
 
+// Other members of a CompoundIntegrator that have loaded a saved run know it by the particles' places, which are about to change.
+IntegratorRun& ConstrainedIntegrator::requireRunForStep() {
+    IntegratorRun& own = requireRun();
+    auto* all = dynamic_cast<OpenMM::CompoundIntegrator*>(&context->getIntegrator());
+    for (int i = 0; all != nullptr && i < all->getNumIntegrators(); i++) {
+        auto* other = dynamic_cast<ConstrainedIntegrator*>(&all->getIntegrator(i));
+        if (other == nullptr || other == this || other->run == nullptr)
+            continue;
+        try {
+            other->run->takeSaved();
+        }
+        catch (const OpenMMException&) {
+            // which is a matter of its own step
+        }
+    }
+    return own;
+}
+
 void ConstrainedIntegrator::step(int steps) {
-    requireRun().step(steps);
+    requireRunForStep().step(steps);
 }
 
 void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int randomSeed) {

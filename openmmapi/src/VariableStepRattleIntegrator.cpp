@@ -228,7 +228,7 @@ void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, c
 }
 
 void VariableStepRattleIntegrator::stepTo(double time) {
-    IntegratorRun& here = requireRun();
+    IntegratorRun& here = requireRunForStep();
     if (!std::isfinite(time))
         throw OpenMMException("VariableStepRattleIntegrator: stepTo() needs a finite time");
     here.stepTo(time);

@@ -9,7 +9,7 @@ import numpy as np
 import openmm
 import pytest
 from dense_reference import chain, energy_of, open_context, positions_of, time_of, value, velocities_of
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
 from openmmvrattle.testsystems import constraint_error
 from run_support import assert_same_run, make_integrator
 
@@ -173,6 +173,33 @@ def test_force_groups_and_temperature_of_a_compound() -> None:
     alone.step(50)
     assert np.array_equal(positions_of(context), positions_of(other))
     assert ours.getIntegrationForceGroups() == 1
+
+
+def test_all_members_go_on_from_a_checkpoint(platform: str) -> None:
+    """Those as well whose turn comes when others have moved the particles, with the density they had."""
+    model = chain()
+    langevin = VariableStepRattleLangevinIntegrator(300, 1, 0.001)
+    langevin.setRandomNumberSeed(3)
+    members = [make_integrator(0.001, "ConstraintAndAppliedForce"), make_integrator(0.0005), langevin]
+    compound = openmm.CompoundIntegrator()
+    for member in members:
+        compound.addIntegrator(member)
+    context = open_context(model.system(), compound, platform, model)
+
+    def run(*turns: int) -> list[np.ndarray]:
+        for turn in turns:
+            compound.setCurrentIntegrator(turn)
+            compound.step(5)
+        densities = [member.getStepDensity() for member in members[:2]]
+        return [positions_of(context), velocities_of(context), np.array(densities)]
+
+    run(0, 1, 2)
+    checkpoint = context.createCheckpoint()
+    undisturbed = run(2, 1, 0)
+    assert np.min(np.abs(undisturbed[2] - 1)) > 1e-4
+    context.loadCheckpoint(checkpoint)
+    for one, other in zip(undisturbed, run(2, 1, 0), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=0 if platform == "Reference" else 1e-5)
 
 
 def test_steps_of_another_integrator_are_noticed_whatever_the_step_count(platform: str) -> None:

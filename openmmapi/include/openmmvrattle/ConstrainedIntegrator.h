@@ -188,6 +188,8 @@ protected:
     void requirePositive(double value, const std::string& name) const;
     void requirePositiveOrZero(double value, const std::string& name, const std::string& zero) const;
     IntegratorRun& requireRun() const;
+    /** The same for one that is about to move the particles. */
+    IntegratorRun& requireRunForStep();
     std::unique_ptr<IntegratorSettings> settings;
     std::unique_ptr<IntegratorRun> run; // in the Context, as long as there is one
 

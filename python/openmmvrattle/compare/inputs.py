@@ -74,12 +74,7 @@ def from_pdb(
         equilibration: its length, ps.
     """
     path = _existing(path)
-    try:
-        pdb = app.PDBFile(str(path))
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as a PDB file ({_sentence(error)}).") from error
-    if pdb.topology.getNumAtoms() == 0:
-        raise InputError(f"{path} has no atoms; is it a PDB file?")
+    pdb = _read_pdb(path)
     try:
         field = app.ForceField(*force_field)
     except Exception as error:
@@ -150,13 +145,7 @@ def from_xml(
         if system.usesPeriodicBoundaryConditions():
             system.setDefaultPeriodicBoxVectors(*state.getPeriodicBoxVectors())
     elif positions_path is not None:
-        try:
-            positions = app.PDBFile(str(_existing(positions_path))).getPositions(asNumpy=True)
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{positions_path} cannot be read as a PDB file ({_sentence(error)}).") from error
-        positions = positions.value_in_unit(unit.nanometer)
+        positions = _read_pdb(_existing(positions_path)).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
     else:
         raise InputError(f"the System in {path} needs a start: give --state STATE.xml or --pdb POSITIONS.pdb as well.")
     if len(positions) != system.getNumParticles():
@@ -299,8 +288,22 @@ def _deserialized(path: str | Path, kind: type, word: str) -> Any:
     return content
 
 
+def _read_pdb(path: Path) -> app.PDBFile:
+    try:
+        pdb = app.PDBFile(str(path))
+    except (AttributeError, IndexError):  # which is how it takes a file without atoms
+        pdb = None
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as a PDB file ({_sentence(error)}).") from error
+    if pdb is None or pdb.topology.getNumAtoms() == 0:
+        raise InputError(f"{path} has no atoms; is it a PDB file?")
+    return pdb
+
+
 def _existing(path: str | Path) -> Path:
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give a file.")
     if not path.is_file():
         raise InputError(f"there is no file {path}.")
     return path
