@@ -31,6 +31,7 @@ def number(value: object, name: str, target: unit.Unit = unit.dimensionless) -> 
 
 
 _LARGEST = 2**31 - 1  # that C++ takes
+PARAMETER_NAME = "the name of a parameter"
 
 
 def integer(value: object, name: str, largest: int = _LARGEST) -> int:
@@ -42,6 +43,20 @@ def integer(value: object, name: str, largest: int = _LARGEST) -> int:
     if not -_LARGEST - 1 <= result <= largest:
         raise openmm.OpenMMException(f"{name} must be an integer from {-_LARGEST - 1} to {largest}, not {result}")
     return result
+
+
+def boolean(value: object, name: str) -> bool:
+    """Return `value`, True or False of any kind, as a bool."""
+    if not isinstance(value, (int, np.bool_)) or value not in (0, 1):
+        raise TypeError(f"{name} must be True or False, not {value!r}")
+    return bool(value)
+
+
+def string(value: object, name: str) -> str:
+    """Return `value`, if it is a string."""
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a string, not {value!r}")
+    return value
 
 
 def parameter(value: object, name: str) -> float:
@@ -76,19 +91,14 @@ def constraint_arguments(
     expression: object, particles: object, parameters: object
 ) -> tuple[str, list[int], dict[str, float]]:
     """Return the expression, the particles, and the values of the parameters of a constraint."""
-    if not isinstance(expression, str):
-        raise TypeError(f"expression must be a string, not {expression!r}")
-    if isinstance(particles, (str, bytes)) or not isinstance(particles, Iterable):
+    if isinstance(particles, (str, bytes, unit.Quantity)) or not isinstance(particles, Iterable):
         raise TypeError(f"particles must be a list of integers, not {particles!r}")
     if not isinstance(parameters, Mapping):
         raise TypeError(f"parameters must be a dict of names and values, not {parameters!r}")
-    for name in parameters:
-        if not isinstance(name, str):
-            raise TypeError(f"the name of a parameter must be a string, not {name!r}")
     return (
-        expression,
+        string(expression, "expression"),
         [integer(particle, "the index of a particle") for particle in particles],
-        {name: parameter(value, name) for name, value in parameters.items()},
+        {string(name, PARAMETER_NAME): parameter(value, name) for name, value in parameters.items()},
     )
 
 

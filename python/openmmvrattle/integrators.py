@@ -16,7 +16,16 @@ import openmm
 from openmm import unit
 
 from . import vrattle
-from ._arguments import constraint_arguments, integer, monitor_arguments, number, parameter
+from ._arguments import (
+    PARAMETER_NAME,
+    boolean,
+    constraint_arguments,
+    integer,
+    monitor_arguments,
+    number,
+    parameter,
+    string,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -146,6 +155,7 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         OpenMMException
             if there is no constraint with this index, or it has no such parameter, or the value is not finite
         """
+        name = string(name, PARAMETER_NAME)
         super().setExpressionParameterValue(integer(index, "index"), name, parameter(value, name))
 
     def getNumForceEvaluations(self) -> int:
@@ -544,8 +554,7 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         ValueError
             if automatic is True and one of the arguments is given that it takes the place of
         """
-        if automatic not in (None, True, False):
-            raise TypeError(f"automatic must be True or False, not {automatic!r}")
+        automatic = automatic is not None and boolean(automatic, "automatic")
         excluded = {
             "updateMethod": updateMethod,
             "maximumStepSize": maximumStepSize,
@@ -1413,9 +1422,7 @@ class VariableStepRattleLangevinIntegrator(ConstrainedIntegrator, vrattle.Variab
         frozen : bool
             whether it stays; if not, it follows the run, unless a value was set. Default: False
         """
-        if frozen not in (True, False):
-            raise TypeError(f"frozen must be True or False, not {frozen!r}")
-        super().freezeReference(bool(frozen))
+        super().freezeReference(boolean(frozen, "frozen"))
 
     def isReferenceFrozen(self) -> bool:
         """Get whether freezeReference() has been called to keep U_ref.

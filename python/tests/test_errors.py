@@ -164,12 +164,21 @@ def test_monitor_settings() -> None:
 def test_wrong_types_and_units() -> None:
     integrator = VariableStepRattleIntegrator(1 * unit.femtosecond)
     assert value(integrator.getStepSize()) == pytest.approx(0.001, rel=1e-15)
-    with pytest.raises(TypeError):
-        integrator.setStepSize(1 * unit.nanometer)
-    with pytest.raises(TypeError):
-        integrator.setStepSize("0.001")
-    with pytest.raises(TypeError):
-        VariableStepRattleIntegrator(None)
+    langevin = openmmvrattle.VariableStepRattleLangevinIntegrator(300, 1, 0.002)
+    calls: list[tuple[str, Callable[[], Any]]] = [
+        ("size", lambda: integrator.setStepSize(1 * unit.nanometer)),
+        ("size", lambda: integrator.setStepSize("0.001")),
+        ("stepSize", lambda: VariableStepRattleIntegrator(None)),
+        ("automatic", lambda: VariableStepRattleIntegrator(0.001, automatic=np.array([1, 2]))),
+        ("frozen", lambda: langevin.freezeReference(np.array([1, 2]))),
+        ("particles", lambda: integrator.addConstraint("x1", 1 * unit.nanometer)),
+        ("expression", lambda: integrator.addConstraint(1, [0])),
+        ("the name of a parameter", lambda: integrator.addConstraint("x1", [0], {1: 2})),
+        ("the name of a parameter", lambda: integrator.setExpressionParameterValue(0, 0, 1)),
+    ]
+    for name, call in calls:
+        with pytest.raises(TypeError, match=f"^{name} must be "):
+            call()
 
 
 def test_without_a_context() -> None:
