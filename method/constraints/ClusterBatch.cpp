@@ -3,6 +3,7 @@
 
 #include "constraints/ClusterBatch.h"
 #include "constraints/Pack.h"
+#include "constraints/Wide.h"
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -14,8 +15,8 @@ using std::vector;
 
 namespace {
 
-// A cluster that has not converged after so many chord iterations is left to Newton's iteration.
-const int MAX_CHORD_ITERATIONS = 12;
+// A cluster that has not converged after so many iterations with one matrix is left to Newton's iteration.
+const int MAX_ITERATIONS = 12;
 
 /** Bonds from particle 0 to each of the others: a diatomic, or CH_n. */
 template <int NumBonds> struct Star {
@@ -101,14 +102,38 @@ public:
         }
         return std::min(numClusters, (first + PACK_SIZE - 1) / PACK_SIZE * PACK_SIZE);
     }
+    const int* getParticles(int cluster) const override {
+        return particles.data() + (size_t) cluster * P;
+    }
     int getFirstConstraint(int cluster) const override {
         return firstConstraint + cluster * B;
     }
-    double solvePositions(const StepArrays& step, int first, int end, double tolerance, int& iterations) const override;
-    double coupledPass(const StepArrays& step, int first, int end) const override;
-    double finish(const OnStepArrays& step, int first, int end) const override;
+    double solvePositions(const StepArrays& step, int first, int end, double tolerance,
+                          int& iterations) const override {
+        return hasWideVectors() ? solveWide(step, first, end, tolerance, iterations)
+                                : solve(step, first, end, tolerance, iterations);
+    }
+    double coupledPass(const StepArrays& step, int first, int end) const override {
+        return hasWideVectors() ? passWide(step, first, end) : pass(step, first, end);
+    }
+    double finish(const OnStepArrays& step, int first, int end) const override {
+        return hasWideVectors() ? completeWide(step, first, end) : complete(step, first, end);
+    }
 
 private:
+    double solve(const StepArrays& step, int first, int end, double tolerance, int& iterations) const;
+    OPENMMVRATTLE_WIDE double solveWide(const StepArrays& step, int first, int end, double tolerance,
+                                        int& iterations) const {
+        return solve(step, first, end, tolerance, iterations);
+    }
+    double pass(const StepArrays& step, int first, int end) const;
+    OPENMMVRATTLE_WIDE double passWide(const StepArrays& step, int first, int end) const {
+        return pass(step, first, end);
+    }
+    double complete(const OnStepArrays& step, int first, int end) const;
+    OPENMMVRATTLE_WIDE double completeWide(const OnStepArrays& step, int first, int end) const {
+        return complete(step, first, end);
+    }
     /** Which clusters a pack holds. Where the last pack is not full its last cluster stands in all the lanes left. */
     struct Lanes {
         const int* particle[PACK_SIZE];
@@ -154,15 +179,17 @@ private:
         return lanes;
     }
     static PackVector load(const Lanes& lanes, int i, const Vec3* from) {
-        const Vec3 &a = from[lanes.particle[0][i]], &b = from[lanes.particle[1][i]];
-        return {Pack{a[0], b[0]}, Pack{a[1], b[1]}, Pack{a[2], b[2]}};
+        const Vec3 &a = from[lanes.particle[0][i]], &b = from[lanes.particle[1][i]], &c = from[lanes.particle[2][i]],
+                   &d = from[lanes.particle[3][i]];
+        return {Pack{a[0], b[0], c[0], d[0]}, Pack{a[1], b[1], c[1], d[1]}, Pack{a[2], b[2], c[2], d[2]}};
     }
     static void store(const Lanes& lanes, int i, const PackVector& x, Vec3* to) {
         for (int lane = 0; lane < PACK_SIZE; lane++)
             to[lanes.particle[lane][i]] = Vec3(x.x[lane], x.y[lane], x.z[lane]);
     }
     static Pack load(const Lanes& lanes, int k, const double* from) {
-        return Pack{from[lanes.constraint[0] + k], from[lanes.constraint[1] + k]};
+        return Pack{from[lanes.constraint[0] + k], from[lanes.constraint[1] + k], from[lanes.constraint[2] + k],
+                    from[lanes.constraint[3] + k]};
     }
     static void store(const Lanes& lanes, int k, Pack x, double* to) {
         for (int lane = 0; lane < PACK_SIZE; lane++)
@@ -178,12 +205,27 @@ private:
                 largest = size;
         }
     }
+    /** The largest size of some numbers, or a NaN if there is one. */
+    static double largestOf(const Pack* x) {
+        Pack largest = packOf(0);
+        for (int k = 0; k < B; k++)
+            largest = largerSize(largest, x[k]);
+        double result = 0;
+        keepLargest(result, largest);
+        return result;
+    }
 
     /** Rows and factor of K at bond vectors r. */
     static void factorize(const Shape& shape, const PackVector* r, Factor& factor);
     /** The smallest D_k/K_kk of a factor. */
     static void keepSmallestPivot(const Shape& shape, const Factor& factor, double& smallest);
     static void solve(const Factor& factor, Pack* x);
+    /** J_kl = C_kl (G(q+)_k . G(q)_l), the matrix of Newton's iteration at the bond vectors next, as L U. */
+    struct NewtonFactor {
+        Pack lower[B][B], upper[B][B], inversePivot[B];
+    };
+    static void factorizeNewton(const Shape& shape, const PackVector* next, const Factor& rows, NewtonFactor& factor);
+    static void solve(const NewtonFactor& factor, Pack* x);
     /** result_k = sum_l C_kl x_l row_l: the bond vectors of M^-1 G^T x. */
     static void addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
                                    PackVector* bonds);
@@ -245,6 +287,35 @@ template <class Topology> void BatchOf<Topology>::solve(const Factor& factor, Pa
 }
 
 template <class Topology>
+void BatchOf<Topology>::factorizeNewton(const Shape& shape, const PackVector* next, const Factor& rows,
+                                        NewtonFactor& factor) {
+    Pack a[B][B];
+    for (int k = 0; k < B; k++)
+        for (int l = 0; l < B; l++)
+            a[k][l] = shape.massCoupling[k][l] * shape.inverseSquareLength[k] * dot(next[k], rows.row[l]);
+    for (int j = 0; j < B; j++) {
+        factor.inversePivot[j] = packOf(1) / a[j][j];
+        for (int k = j + 1; k < B; k++) {
+            factor.upper[j][k] = a[j][k];
+            factor.lower[k][j] = a[k][j] * factor.inversePivot[j];
+            for (int l = j + 1; l < B; l++)
+                a[k][l] -= factor.lower[k][j] * a[j][l];
+        }
+    }
+}
+
+template <class Topology> void BatchOf<Topology>::solve(const NewtonFactor& factor, Pack* x) {
+    for (int i = 1; i < B; i++)
+        for (int k = 0; k < i; k++)
+            x[i] -= factor.lower[i][k] * x[k];
+    for (int i = B - 1; i >= 0; i--) {
+        for (int k = i + 1; k < B; k++)
+            x[i] -= factor.upper[i][k] * x[k];
+        x[i] = x[i] * factor.inversePivot[i];
+    }
+}
+
+template <class Topology>
 void BatchOf<Topology>::addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
                                            PackVector* bonds) {
     PackVector force[B];
@@ -267,8 +338,7 @@ void BatchOf<Topology>::addConstraintForces(const Shape& shape, const Factor& fa
 }
 
 template <class Topology>
-double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int end, double tolerance,
-                                         int& iterations) const {
+double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, double tolerance, int& iterations) const {
     const Pack kick = packOf(step.kick), drift = packOf(step.drift);
     const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
     double worst = 0;
@@ -278,31 +348,36 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
         PackVector q[P], w[P], r[B], unconstrained[B], next[B];
         for (int i = 0; i < P; i++) {
             q[i] = load(lanes, i, step.q);
-            w[i] = load(lanes, i, step.start) + load(lanes, i, step.force) * (kick * shape.inverseMass[i]);
+            w[i] = load(lanes, i, step.start);
+            if (step.force != nullptr)
+                w[i] = w[i] + load(lanes, i, step.force) * (kick * shape.inverseMass[i]);
         }
         for (int k = 0; k < B; k++) {
             r[k] = bondOf(q, k);
             unconstrained[k] = r[k] + bondOf(w, k) * drift;
         }
-        Factor factor;
-        factorize(shape, r, factor);
+        Factor rows;
+        for (int k = 0; k < B; k++)
+            rows.row[k] = r[k] * shape.inverseSquareLength[k];
         Pack lambda[B], g[B];
         for (int k = 0; k < B; k++)
             lambda[k] = load(lanes, k, step.lambda);
+        NewtonFactor factor;
         double error = 0, previous = std::numeric_limits<double>::infinity();
         int iteration = 0;
         while (true) {
-            std::copy(unconstrained, unconstrained + B, next);
-            addConstraintBonds(shape, factor, lambda, scale, next);
-            evaluate(shape, next, g);
-            error = 0;
             for (int k = 0; k < B; k++)
-                keepLargest(error, g[k]);
+                next[k] = unconstrained[k];
+            addConstraintBonds(shape, rows, lambda, scale, next);
+            evaluate(shape, next, g);
+            error = largestOf(g);
             // Where the error is no longer reduced it is rounding, or the caller's to deal with.
             if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous)))
                 break;
-            if (iteration == MAX_CHORD_ITERATIONS)
+            if (iteration == MAX_ITERATIONS)
                 break;
+            if (iteration == 0)
+                factorizeNewton(shape, next, rows, factor);
             solve(factor, g);
             for (int k = 0; k < B; k++)
                 lambda[k] += g[k] * inverseScale;
@@ -312,7 +387,7 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
         iterations = std::max(iterations, iteration);
         if (error > worst || std::isnan(error))
             worst = error;
-        addConstraintForces(shape, factor, lambda, -kick, w);
+        addConstraintForces(shape, rows, lambda, -kick, w);
         for (int i = 0; i < P; i++) {
             store(lanes, i, w[i], step.wNext);
             store(lanes, i, q[i] + w[i] * drift, step.qNext);
@@ -323,7 +398,7 @@ double BatchOf<Topology>::solvePositions(const StepArrays& step, int first, int 
     return worst;
 }
 
-template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays& step, int first, int end) const {
+template <class Topology> double BatchOf<Topology>::pass(const StepArrays& step, int first, int end) const {
     const Pack kick = packOf(step.kick), drift = packOf(step.drift), inverseDrift = packOf(1 / step.drift);
     const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
     double worst = 0;
@@ -373,7 +448,7 @@ template <class Topology> double BatchOf<Topology>::coupledPass(const StepArrays
     return worst;
 }
 
-template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& step, int first, int end) const {
+template <class Topology> double BatchOf<Topology>::complete(const OnStepArrays& step, int first, int end) const {
     const Pack kick = packOf(step.kick);
     double smallestPivot = std::numeric_limits<double>::infinity();
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
@@ -408,6 +483,14 @@ template <class Topology> double BatchOf<Topology>::finish(const OnStepArrays& s
         solve(factor, multipliers);
         for (int k = 0; k < B; k++)
             store(lanes, k, multipliers[k], step.lambda);
+        if (step.acceleration != nullptr) {
+            PackVector net[P];
+            for (int i = 0; i < P; i++)
+                net[i] = acceleration[i];
+            addConstraintForces(shape, factor, multipliers, packOf(-1), net);
+            for (int i = 0; i < P; i++)
+                store(lanes, i, net[i], step.acceleration);
+        }
         if (step.lambdaHalf == nullptr)
             continue;
         for (int k = 0; k < B; k++) {

@@ -19,7 +19,7 @@ namespace OpenMMVRattle {
 struct StepArrays {
     const OpenMM::Vec3* q;      // q[n]
     const OpenMM::Vec3* start; // the velocities before the kick: M^-1 p[n-1/2], or v of a step from the on-step state
-    const OpenMM::Vec3* force; // F(q[n])
+    const OpenMM::Vec3* force; // F(q[n]), or null if there is none
     OpenMM::Vec3* qNext; // q[n+1]
     OpenMM::Vec3* wNext; // M^-1 p[n+1/2]
     double* lambda; // the multipliers of the step
@@ -39,6 +39,7 @@ struct OnStepArrays {
     double* rightSide; // K times it
     double* lambdaHalf; // Lambda(q[n+1], p[n+1/2]); null if it is not wanted, and so is the following
     double* rightSideHalf; // K times it
+    OpenMM::Vec3* acceleration; // M^-1 (F - G^T Lambda), or null if it is not wanted
     double kick; // of (3.12), h/(2 rho)
 };
 
@@ -66,11 +67,13 @@ public:
      * order of their first particles.
      */
     virtual int findCluster(int particle) const = 0;
+    /** The particles of a cluster; those of the next follow. */
+    virtual const int* getParticles(int cluster) const = 0;
     /** The first constraint of a cluster in the internal order. */
     virtual int getFirstConstraint(int cluster) const = 0;
     /**
-     * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by chord iterations, each cluster as
-     * many as it needs.
+     * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by Newton's iteration with the matrix of
+     * the guess, each pack of clusters as often as it needs.
      *
      * @param tolerance    stop where the largest |g| of the cluster is this small, after at least one update
      * @param[in,out] iterations    the number of updates of the cluster that needed most

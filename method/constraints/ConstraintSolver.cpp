@@ -99,6 +99,9 @@ struct ConstraintSolver::Pass {
     /** When the unknowns have been found. */
     void update(const Part&) const {
     }
+    /** When those of the last stage have, for all that has particles. */
+    void complete(const Part&) const {
+    }
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     Observer* const observer;
@@ -107,7 +110,10 @@ struct ConstraintSolver::Pass {
 // The chord iteration for (3.11), A = -kick drift K(q); each stage is an iteration.
 struct ConstraintSolver::ChordPass : Pass {
     ChordPass(ConstraintSolver& solver, const Trial& trial, const Guess& guess) :
-            Pass(solver), trial(trial), guess(guess), arrays(solver.arraysOf(trial)),
+            ChordPass(solver, trial, guess, *solver.q, solver.force->data()) {
+    }
+    ChordPass(ConstraintSolver& solver, const Trial& trial, const Guess& guess, const Vectors& q, const Vec3* force) :
+            Pass(solver), trial(trial), guess(guess), arrays(solver.arraysOf(trial, q, force)),
             aim(guess.margin * solver.tolerance) {
     }
     int numStages() const {
@@ -121,7 +127,7 @@ struct ConstraintSolver::ChordPass : Pass {
         share.addError(batch.solvePositions(arrays, begin, end, aim, share.iterations));
     }
     void runFree(int particle) const {
-        solver.moveFreeParticle(trial, particle);
+        solver.moveFreeParticle(arrays, particle);
     }
     void move(int stage, const Part& part) const {
         solver.moveParticles(trial, part, stage > 0); // there is at least one update
@@ -150,11 +156,47 @@ struct ConstraintSolver::ChordPass : Pass {
     const double aim;
 };
 
+// The first of two trials, and for the batches and the free particles the second as well.
+struct ConstraintSolver::FirstPass : ChordPass {
+    FirstPass(ConstraintSolver& solver, const Trial& trial, const Guess& guess, Change& change,
+              const ChordPass& second) : ChordPass(solver, trial, guess), change(change), second(second) {
+    }
+    void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
+        Result first, next;
+        ChordPass::runBatch(batch, begin, end, first);
+        const int* particles = batch.getParticles(begin);
+        change.changeVelocities(particles, (int) (batch.getParticles(end) - particles));
+        second.runBatch(batch, begin, end, next);
+        share.addError(first.error);
+        share.addError(next.error);
+        share.addBatchIterations(first.iterations + next.iterations);
+    }
+    void seeBlock(int block) const {
+        const auto& blocks = system.getBlocks();
+        const int* particles = system.getFreeParticles().data() + blocks[block].freeParticle;
+        const int count = blocks[block + 1].freeParticle - blocks[block].freeParticle;
+        change.changeVelocities(particles, count);
+        std::for_each(particles, particles + count, [&](int i) { second.runFree(i); });
+    }
+    Change& change;
+    const ChordPass& second;
+};
+
+// The second of them for the others.
+struct ConstraintSolver::SecondPass : ChordPass {
+    using ChordPass::ChordPass;
+    void runBatch(const ClusterBatch&, int, int, Result&) const {
+    }
+    void runFree(int) const {
+    }
+};
+
 // One chord iteration with Lambda(q,p+), its only stage.
 struct ConstraintSolver::CoupledPass : Pass {
     CoupledPass(ConstraintSolver& solver, const Trial& trial, const Coupled& coupled, const Guess* guess,
                 Observer* observer) :
-            Pass(solver, observer), trial(trial), coupled(coupled), guess(guess), arrays(solver.arraysOf(trial)) {
+            Pass(solver, observer), trial(trial), coupled(coupled), guess(guess),
+            arrays(solver.arraysOf(trial, *solver.q, solver.force->data())) {
         arrays.lambdaPlus = coupled.multipliers.data();
         arrays.rightSidePlus = coupled.rightSide.data();
     }
@@ -174,7 +216,7 @@ struct ConstraintSolver::CoupledPass : Pass {
         share.addError(batch.coupledPass(arrays, begin, end));
     }
     void runFree(int particle) const {
-        solver.moveFreeParticle(trial, particle);
+        solver.moveFreeParticle(arrays, particle);
     }
     void move(int, const Part& part) const {
         solver.moveParticles(trial, part, true);
@@ -210,6 +252,7 @@ struct ConstraintSolver::FinishPass : Pass {
                    state.rightSide.data(),
                    half != nullptr ? half->multipliers.data() : nullptr,
                    half != nullptr ? half->rightSide.data() : nullptr,
+                   state.accelerations != nullptr ? state.accelerations->data() : nullptr,
                    state.kick} {
     }
     int numStages() const {
@@ -225,7 +268,10 @@ struct ConstraintSolver::FinishPass : Pass {
         share.addPivot(batch.finish(arrays, begin, end));
     }
     void runFree(int i) const {
-        state.velocities[i] = state.halfStep[i] + state.forces[i] * (state.kick * system.getInverseMasses()[i]);
+        const Vec3 acceleration = state.forces[i] * system.getInverseMasses()[i];
+        state.velocities[i] = state.halfStep[i] + acceleration * state.kick;
+        if (state.accelerations != nullptr)
+            (*state.accelerations)[i] = acceleration;
     }
     void move(int stage, const Part& part) const {
         const vector<int>& particles = system.getGeneralParticles();
@@ -258,6 +304,10 @@ struct ConstraintSolver::FinishPass : Pass {
         if (stage == 0)
             return {&solver.correction, nullptr};
         return {&state.multipliers, half != nullptr ? &half->multipliers : nullptr};
+    }
+    void complete(const Part& part) const {
+        if (state.accelerations != nullptr)
+            system.addTransposedOverMass(jacobian, state.multipliers, -1.0, *state.accelerations, part);
     }
     const OnStep& state;
     HalfStep* half;
@@ -307,6 +357,7 @@ template <class Each> void ConstraintSolver::runWhole(const Each& pass, const Pa
                 matrix.solve(*x, part);
         pass.update(part);
     }
+    pass.complete(part);
     pass.seePart(part);
     share.addError(error);
 }
@@ -358,8 +409,10 @@ template <class Each> void ConstraintSolver::runCut(const Each& pass, Result& re
             pass.update(piece);
             if (isMore)
                 share.addError(beginStage(pass, stage + 1, piece));
-            else
+            else {
+                pass.complete(piece);
                 pass.seePart(piece);
+            }
         });
         if (isMore)
             error = pieces.error;
@@ -504,10 +557,10 @@ double ConstraintSolver::findMultiplierRounding(bool isMassWeighted, const Vecto
 
 // ------------------------------------------------------------------------------------------------------ a step from there
 
-StepArrays ConstraintSolver::arraysOf(const Trial& trial) {
-    return {q->data(),
+StepArrays ConstraintSolver::arraysOf(const Trial& trial, const Vectors& from, const Vec3* forces) {
+    return {from.data(),
             trial.start.data(),
-            force->data(),
+            forces,
             trial.positions.data(),
             trial.velocities.data(),
             trial.multipliers.data(),
@@ -539,9 +592,11 @@ void ConstraintSolver::moveParticles(const Trial& trial, const Part& part, bool 
     moveParticles(trial, particles + part.firstParticle, particles + part.endParticle, part, withVelocities);
 }
 
-void ConstraintSolver::moveFreeParticle(const Trial& trial, int i) {
-    trial.velocities[i] = trial.start[i] + (*force)[i] * (trial.kick * system.getInverseMasses()[i]);
-    trial.positions[i] = (*q)[i] + trial.velocities[i] * trial.drift;
+void ConstraintSolver::moveFreeParticle(const StepArrays& step, int i) const {
+    step.wNext[i] = step.start[i];
+    if (step.force != nullptr)
+        step.wNext[i] += step.force[i] * (step.kick * system.getInverseMasses()[i]);
+    step.qNext[i] = step.q[i] + step.wNext[i] * step.drift;
 }
 
 bool ConstraintSolver::solvePositions(const Trial& trial, const Guess& guess) {
@@ -550,6 +605,37 @@ bool ConstraintSolver::solvePositions(const Trial& trial, const Guess& guess) {
     lastError = result.error;
     numIterations += result.iterations;
     return lastError <= tolerance || solveByNewton(trial, guess);
+}
+
+bool ConstraintSolver::solveInTurn(const Trial& trial, const Guess& guess, Change& change, const Trial& second,
+                                   const Guess& secondGuess, const Vectors& noForce) {
+    const Vectors &qBefore = *q, &forceBefore = *force;
+    const ExpressionParameters& thetaBefore = *theta;
+    try {
+        ensureGeneralFactor();
+        const Result first = run(
+            FirstPass(*this, trial, guess, change, ChordPass(*this, second, secondGuess, trial.positions, nullptr)));
+        if (!(first.error <= tolerance))
+            return false;
+        Result next;
+        moveTo(trial.positions, trial.parameters, noForce);
+        if (system.getFirstGeneral() < system.getNumConstraints()) {
+            const vector<int>& particles = system.getGeneralParticles();
+            share((int) particles.size(),
+                  [&](int begin, int end) { change.changeVelocities(particles.data() + begin, end - begin); });
+            ensureGeneralFactor();
+            next = run(SecondPass(*this, second, secondGuess));
+        }
+        if (next.error <= tolerance) {
+            lastError = std::max(first.error, next.error);
+            numIterations += std::max(first.batchIterations, first.iterations + next.iterations);
+            return true;
+        }
+    }
+    catch (const StepFailure&) { // to be met again, and explained, by whoever does one after the other
+    }
+    moveTo(qBefore, thetaBefore, forceBefore);
+    return false;
 }
 
 // The same for all constraints with Newton's iteration: G(q+) M^-1 G(q)^T in place of K. Where the chord iteration fails.

@@ -197,6 +197,22 @@ public:
      * @return whether it is solved; if not, explainFailure() says what is in the way
      */
     bool solvePositions(const Trial& trial, const Guess& guess);
+    /** What happens to velocities between two trials; several threads may ask for it at once, each for other particles. */
+    class Change {
+    public:
+        virtual ~Change() {
+        }
+        virtual void changeVelocities(const int* particles, int count) = 0;
+    };
+    /**
+     * Solve two trials, the second of which begins where the first has ended, with velocities that are changed in between and without
+     * forces; block by block the same as solvePositions(), all the changes, moveTo() the positions of the first, and solvePositions().
+     *
+     * @param noForce    zeros
+     * @return whether it is solved; if not, all is to be done one after the other, and nothing has been moved to
+     */
+    bool solveInTurn(const Trial& trial, const Guess& guess, Change& change, const Trial& second,
+                     const Guess& secondGuess, const Vectors& noForce);
     /** Begin with a guess without that iteration. */
     void guess(const Trial& trial, const Guess& guess);
     std::string explainFailure(const Trial& trial);
@@ -242,6 +258,7 @@ public:
         Vectors& velocities; // v
         std::vector<double>&multipliers, &rightSide; // Lambda and K Lambda
         HalfStep* atHalfStep; // or null if it is not wanted
+        Vectors* accelerations = nullptr; // M^-1 (F - G^T Lambda), or null
     };
     /**
      * Complete a step. The positions of moveTo() remain, but what was known there has to be formed again.
@@ -280,6 +297,8 @@ private:
     enum FactorScope { NoFactor, GeneralFactor, FullFactor };
     struct Pass;
     struct ChordPass;
+    struct FirstPass;
+    struct SecondPass;
     struct CoupledPass;
     struct FinishPass;
     int rangeOf(const Part& part) const {
@@ -300,10 +319,10 @@ private:
 
     void ensureFactor(FactorScope scope);
     void ensureGeneralFactor();
-    StepArrays arraysOf(const Trial& trial);
+    StepArrays arraysOf(const Trial& trial, const Vectors& q, const OpenMM::Vec3* force);
     void moveParticles(const Trial& trial, const int* first, const int* end, const Part& part, bool withVelocities);
     void moveParticles(const Trial& trial, const Part& part, bool withVelocities);
-    void moveFreeParticle(const Trial& trial, int i);
+    void moveFreeParticle(const StepArrays& step, int i) const;
     void guess(const Trial& trial, const Guess& guess, int first, int end) const;
     bool solveByNewton(const Trial& trial, const Guess& guess);
     bool iterateNewton(const Trial& trial);

@@ -6,52 +6,23 @@
 
 namespace OpenMMVRattle {
 
-/** The number of clusters that are worked on at once: what the baseline instruction sets (SSE2, NEON) hold. */
-const int PACK_SIZE = 2;
+/** The number of clusters that are worked on at once: a register of AVX2, or two of the baseline instruction sets (SSE2, NEON). */
+const int PACK_SIZE = 4;
 
 /**
- * PACK_SIZE numbers, one of each of as many clusters, with the arithmetic of one. Compilers that know vector types use
- * the processor's; the library is built for the baseline instruction set, so that it runs on every processor.
+ * PACK_SIZE numbers, one of each of as many clusters, with the arithmetic of one. The library is built for the baseline instruction set,
+ * so that it runs on every processor, and what is done with packs for wide registers as well (Wide.h).
  */
-#if defined(__GNUC__)
-typedef double Pack __attribute__((vector_size(PACK_SIZE * sizeof(double))));
+typedef double Pack __attribute__((vector_size(PACK_SIZE * sizeof(double)), aligned(PACK_SIZE * sizeof(double))));
 
 inline Pack packOf(double x) {
-    return Pack{x, x};
+    return Pack{x, x, x, x};
 }
-#else
-struct Pack {
-    double x[PACK_SIZE];
-    double& operator[](int i) {
-        return x[i];
-    }
-    double operator[](int i) const {
-        return x[i];
-    }
-};
-
-inline Pack packOf(double x) {
-    return Pack{{x, x}};
+/** The larger one of a, which is not negative, and the size of b; or a NaN if one is. */
+inline Pack largerSize(Pack a, Pack b) {
+    const Pack size = b < packOf(0) ? -b : b;
+    return a >= size || a != a ? a : size;
 }
-inline Pack operator+(Pack a, Pack b) {
-    return Pack{{a[0] + b[0], a[1] + b[1]}};
-}
-inline Pack operator-(Pack a, Pack b) {
-    return Pack{{a[0] - b[0], a[1] - b[1]}};
-}
-inline Pack operator*(Pack a, Pack b) {
-    return Pack{{a[0] * b[0], a[1] * b[1]}};
-}
-inline Pack operator/(Pack a, Pack b) {
-    return Pack{{a[0] / b[0], a[1] / b[1]}};
-}
-inline Pack& operator+=(Pack& a, Pack b) {
-    return a = a + b;
-}
-inline Pack& operator-=(Pack& a, Pack b) {
-    return a = a - b;
-}
-#endif
 
 } // namespace OpenMMVRattle
 

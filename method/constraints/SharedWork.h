@@ -32,7 +32,7 @@ public:
     /** What tasks find: the largest error, the smallest pivot (a NaN counts), and the like. */
     struct Result {
         double error = 0, pieceError = 0, pivot = std::numeric_limits<double>::infinity();
-        int iterations = 0, failed = ConstraintMatrix::REGULAR;
+        int iterations = 0, batchIterations = 0, failed = ConstraintMatrix::REGULAR;
         std::exception_ptr exception; // that ended a thread's share
         void addError(double other) {
             error = larger(error, other);
@@ -49,12 +49,16 @@ public:
         void addIterations(int other) {
             iterations = std::max(iterations, other);
         }
+        void addBatchIterations(int other) { // of several trials, where they are counted apart
+            batchIterations = std::max(batchIterations, other);
+        }
         void merge(const Result& other) {
             addError(other.error);
             addPieceError(other.pieceError);
             addPivot(other.pivot);
             addFailed(other.failed);
             addIterations(other.iterations);
+            addBatchIterations(other.batchIterations);
         }
     };
 

@@ -318,6 +318,10 @@ template <class Method> void HostRunDevice<Method>::writeMovingVelocities(const 
 
 template <class Method> void HostRunDevice<Method>::copyMoving(const Vectors& from, Vectors& to) {
     method.share((int) masses.size(), [&](int first, int end) {
+        if (!hasMassless) {
+            std::copy(from.begin() + first, from.begin() + end, to.begin() + first);
+            return;
+        }
         for (int i = first; i < end; i++)
             if (masses[i] > 0)
                 to[i] = from[i];

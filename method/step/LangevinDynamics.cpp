@@ -48,6 +48,15 @@ LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<Di
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     noForce.resize(getConstraintSystem().getNumParticles());
+    netAccelerations.resize(getConstraintSystem().getNumParticles());
+    vector<char> isTied(getConstraintSystem().getNumParticles(), false);
+    for (int k = 0; k < getConstraintSystem().getNumConstraints(); k++)
+        if (!getConstraintSystem().isExpression(k))
+            isTied[getConstraintSystem().getConstraint(k).particle1] =
+                isTied[getConstraintSystem().getConstraint(k).particle2] = true;
+    for (int i : solver.getMovingParticles())
+        if (!isTied[i])
+            loose.push_back(i);
     theta = thetaNow = thetaMiddle = thetaNext = getConstraintSystem().getGivenParameters();
     clusterSums.resize(clusterForces.getNumClusters());
     clusterForces.sumOverClusters([](int) { return 1.0; }, clusterSums);
@@ -138,23 +147,28 @@ int LangevinDynamics::findDoublings(double u) const {
     return result;
 }
 
-double LangevinDynamics::evaluateMonitor(const Vectors& positions, const ExpressionParameters& parameters,
-                                         const Vectors& velocities, const Vectors& forces,
-                                         const vector<double>& multipliers) {
-    const Vectors& netForces = clusterForces.findNetForces(positions, parameters, forces, multipliers);
-    const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
+double LangevinDynamics::evaluateMonitor(const Vectors& accelerations, const Vectors& velocities) {
+    const vector<double>& masses = getConstraintSystem().getMasses();
     clusterForces.sumOverClusters(
         [&](int i) {
-            const double square = netForces[i].dot(netForces[i]), speedSquared = velocities[i].dot(velocities[i]);
-            return square * inverseMasses[i] + std::sqrt(square) * speedSquared * (1 / FLIGHT_LENGTH);
+            const double square = accelerations[i].dot(accelerations[i]),
+                         speedSquared = velocities[i].dot(velocities[i]);
+            return masses[i] * (square + std::sqrt(square) * speedSquared * (1 / FLIGHT_LENGTH));
         },
         clusterSums);
     return clusterForces.eighthRootOfFourthPowers(clusterSums);
 }
 
-// The first of the particles with mass whose vector is no number, or -1.
-int LangevinDynamics::findNotFinite(const Vectors& x) {
-    const vector<int>& particles = solver.getMovingParticles();
+// The same for the state between two steps.
+double LangevinDynamics::evaluateMonitorOfState() {
+    const Vectors& netForces = clusterForces.findNetForces(q, theta, force, lambda);
+    for (int i : solver.getMovingParticles())
+        netAccelerations[i] = netForces[i] * getConstraintSystem().getInverseMasses()[i];
+    return evaluateMonitor(netAccelerations, v);
+}
+
+// The first of some particles whose vector is no number, or -1.
+int LangevinDynamics::findNotFinite(const Vectors& x, const vector<int>& particles) {
     const double sum = solver.sum((int) particles.size(), [&](int p) { // of zeros, or a NaN
         const Vec3& each = x[particles[p]];
         return (each[0] - each[0]) + (each[1] - each[1]) + (each[2] - each[2]);
@@ -215,14 +229,14 @@ void LangevinDynamics::settle() {
 
 // P v, Lambda and U at q.
 void LangevinDynamics::evaluateOnStep() {
-    if (findNotFinite(force) >= 0)
+    if (findNotFinite(force, solver.getMovingParticles()) >= 0)
         throw StepFailure(solver.explainForces(force));
     wNext = v;
     solver.moveTo(q, theta, force);
-    solver.finish({q, wNext, force, theta, 0.0, v, lambda, rightSide, nullptr});
+    solver.finish({q, wNext, force, theta, 0.0, v, lambda, rightSide, nullptr, &netAccelerations});
     solver.moveToEnd();
     isAtStart = true;
-    values[0] = evaluateMonitor(q, theta, v, force, lambda);
+    values[0] = evaluateMonitor(netAccelerations, v);
 }
 
 std::function<void()> LangevinDynamics::remember() {
@@ -278,7 +292,7 @@ bool LangevinDynamics::changeFrame(const Vectors& before, const Vectors& velocit
     });
     // What is removed in each step is less than U is known to.
     if (square * count > SMALL_SHIFT * SMALL_SHIFT * squares)
-        values[0] = evaluateMonitor(q, theta, v, force, lambda);
+        values[0] = evaluateMonitorOfState();
     return true;
 }
 
@@ -320,22 +334,21 @@ LangevinDynamics::Noise LangevinDynamics::findNoise() const {
 }
 
 // v <- a v + sqrt(kT (1 - a^2)) M^-1/2 xi. The numbers xi are those of the step, whatever attempt asks for them.
-void LangevinDynamics::addNoise(Vectors& velocities) {
+void LangevinDynamics::addNoise(const int* particles, int count, Vectors& velocities) const {
     const double a = findNoise().damping, s = findNoise().size;
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
-    const vector<int>& particles = solver.getMovingParticles();
-    if (a == 1)
-        return;
-    solver.share((int) particles.size(), [&](int first, int end) {
-        for (int p = first; p < end; p++) {
-            const int i = particles[p];
+    Vec3 numbers[RandomNumbers::BLOCK];
+    for (int first = 0; first < count && a != 1; first += RandomNumbers::BLOCK) {
+        const int size = std::min(RandomNumbers::BLOCK, count - first);
+        if (s > 0 && givenNoise.empty())
+            RandomNumbers::normal((uint64_t) seed, (uint64_t) numDrawn, particles + first, size, numbers);
+        for (int k = 0; k < size; k++) {
+            const int i = particles[first + k];
             velocities[i] *= a;
             if (s > 0)
-                velocities[i] += (givenNoise.empty() ? RandomNumbers::normal((uint64_t) seed, (uint64_t) numDrawn, i)
-                                                     : givenNoise[i]) *
-                                 (s * std::sqrt(inverseMasses[i]));
+                velocities[i] += (givenNoise.empty() ? numbers[k] : givenNoise[i]) * (s * std::sqrt(inverseMasses[i]));
         }
-    });
+    }
 }
 
 double LangevinDynamics::step(double) {
@@ -365,7 +378,7 @@ void LangevinDynamics::startAttempt() {
 // The attempt has failed.
 void LangevinDynamics::raise(const std::string& reason) {
     if (doublings == settings.langevin.maxDoublings) {
-        evaluateMonitor(q, theta, v, force, lambda);
+        evaluateMonitorOfState();
         const auto hardest = std::max_element(clusterSums.begin(), clusterSums.end());
         std::stringstream message;
         message << reason << ", in a step of " << LangevinSettings::getSubsteps(doublings)
@@ -390,13 +403,36 @@ bool LangevinDynamics::trySubstep(std::string& reason) {
     if (2 * substep + 1 != substeps)
         return tryDrift({start, 0.5 * d, d, thetaNext, qNext, wNext, multipliers}, guess, reason);
 
+    return tryCentralDrift(start, d, guess, reason);
+}
+
+// Half of it, noise, and the other half.
+bool LangevinDynamics::tryCentralDrift(const Vectors& start, double d, const vector<double>& guess,
+                                       std::string& reason) {
+    struct Noise : ConstraintSolver::Change {
+        explicit Noise(LangevinDynamics& dynamics) : dynamics(dynamics) {
+        }
+        void changeVelocities(const int* particles, int count) override {
+            dynamics.addNoise(particles, count, dynamics.wMiddle);
+        }
+        LangevinDynamics& dynamics;
+    } noise(*this);
     motion.follow(0.5 * settings.stepSize, settings.stepSize, thetaMiddle);
-    if (!tryDrift({start, 0.5 * d, 0.5 * d, thetaMiddle, qMiddle, wMiddle, multipliers}, guess, reason))
+    const ConstraintSolver::Trial toNoise{start, 0.5 * d, 0.5 * d, thetaMiddle, qMiddle, wMiddle, multipliers};
+    const ConstraintSolver::Trial fromNoise{wMiddle, 0.5 * d, 0.5 * d, thetaNext, qNext, wNext, multipliers};
+    if (solver.solveInTurn(toNoise, {guess, nullptr, MARGIN}, noise, fromNoise, {noMultipliers, nullptr, MARGIN},
+                           noForce)) {
+        isAtStart = false;
+        return !isNowhere(qNext, reason);
+    }
+    if (!tryDrift(toNoise, guess, reason))
         return false;
-    addNoise(wMiddle);
+    const vector<int>& particles = solver.getMovingParticles();
+    solver.share((int) particles.size(),
+                 [&](int first, int end) { noise.changeVelocities(particles.data() + first, end - first); });
     isAtStart = false;
     solver.moveTo(qMiddle, thetaMiddle, noForce);
-    return tryDrift({wMiddle, 0.5 * d, 0.5 * d, thetaNext, qNext, wNext, multipliers}, noMultipliers, reason);
+    return tryDrift(fromNoise, noMultipliers, reason);
 }
 
 bool LangevinDynamics::tryDrift(const ConstraintSolver::Trial& trial, const vector<double>& guess,
@@ -411,28 +447,39 @@ bool LangevinDynamics::tryDrift(const ConstraintSolver::Trial& trial, const vect
         reason = failure.what();
         return false;
     }
-    const int lost = findNotFinite(trial.positions);
+    return !isNowhere(trial.positions, reason);
+}
+
+// Whether a position is no number, where constraints have been solved for.
+bool LangevinDynamics::isNowhere(const Vectors& positions, std::string& reason) {
+    const int lost = findNotFinite(positions, loose);
     if (lost >= 0)
         reason = "the position of particle " + std::to_string(lost) + " became infinite or not a number";
-    return lost < 0;
+    return lost >= 0;
 }
 
 bool LangevinDynamics::finish(Vectors& forces, double energy) {
     const int substeps = LangevinSettings::getSubsteps(doublings);
     isAtStart = false;
-    const int lost = findNotFinite(forces);
-    if (lost >= 0) {
-        raise("the force on particle " + std::to_string(lost) + " became infinite or not a number");
+    const bool isLast = substep + 1 == substeps;
+    auto isForceLost = [&] {
+        const int lost = findNotFinite(forces, solver.getMovingParticles());
+        if (lost >= 0)
+            raise("the force on particle " + std::to_string(lost) + " became infinite or not a number");
+        return lost >= 0;
+    };
+    if (!isLast && isForceLost()) // at the end U would tell
         return false;
-    }
     try {
-        solver.finish({qNext, wNext, forces, thetaNext, 0.5 * findSubstep(), vNext, lambdaNext, rightSide, nullptr});
+        solver.finish({qNext, wNext, forces, thetaNext, 0.5 * findSubstep(), vNext, lambdaNext, rightSide, nullptr,
+                       isLast ? &netAccelerations : nullptr});
     }
     catch (const StepFailure& failure) {
         raise(failure.what());
         return false;
     }
-    if (++substep < substeps) {
+    substep++;
+    if (!isLast) {
         qNow.swap(qNext);
         vNow.swap(vNext);
         std::swap(thetaNow, thetaNext);
@@ -441,9 +488,10 @@ bool LangevinDynamics::finish(Vectors& forces, double energy) {
         solver.moveToEnd(qNow, thetaNow, forceNow);
         return false;
     }
-    const double u = evaluateMonitor(qNext, thetaNext, vNext, forces, lambdaNext);
+    const double u = evaluateMonitor(netAccelerations, vNext);
     if (!std::isfinite(u)) {
-        raise("the monitor U became infinite or not a number");
+        if (!isForceLost())
+            raise("the monitor U became infinite or not a number");
         return false;
     }
     if (doublings < settings.langevin.maxDoublings && findDoublings(u) > doublings) {

@@ -197,16 +197,18 @@ private:
     void startReference();
     void followReference();
     int findDoublings(double u) const;
-    double evaluateMonitor(const Vectors& positions, const ExpressionParameters& parameters, const Vectors& velocities,
-                           const Vectors& forces, const std::vector<double>& multipliers);
+    double evaluateMonitor(const Vectors& netAccelerations, const Vectors& velocities);
+    double evaluateMonitorOfState();
     void takeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy);
     void evaluateOnStep();
     void settle();
-    void addNoise(Vectors& velocities);
-    int findNotFinite(const Vectors& x);
+    void addNoise(const int* particles, int count, Vectors& velocities) const;
+    int findNotFinite(const Vectors& x, const std::vector<int>& particles);
+    bool isNowhere(const Vectors& positions, std::string& reason);
     void startAttempt();
     void raise(const std::string& reason);
     bool trySubstep(std::string& reason);
+    bool tryCentralDrift(const Vectors& start, double d, const std::vector<double>& guess, std::string& reason);
     bool tryDrift(const ConstraintSolver::Trial& trial, const std::vector<double>& guess, std::string& reason);
     double findSubstep() const {
         return settings.stepSize / LangevinSettings::getSubsteps(doublings);
@@ -215,33 +217,35 @@ private:
     ConstraintSolver solver;
     ParameterMotion motion;
     ClusterForces clusterForces;
+    std::vector<int> loose; // the particles without a distance constraint, whose error would tell that they are nowhere
     Settings settings;
 
     // The state between two steps.
     Vectors q, v, force;
     double groupEnergy;
-    ExpressionParameters theta;  // theta[n], with the rates of the step that has led to q[n]
-    std::vector<double> lambda;  // Lambda(q[n],p[n])
-    std::vector<double> values;  // U(q[n],p[n]), alone
-    double reference;            // U_ref, 0 while it is not known
-    double lastSubstep;          // d of the last step; H if there was none since the state was changed
-    int64_t seed;                // 0: there is none yet
-    int64_t numDrawn;            // steps that have drawn noise
+    ExpressionParameters theta; // theta[n], with the rates of the step that has led to q[n]
+    std::vector<double> lambda; // Lambda(q[n],p[n])
+    std::vector<double> values; // U(q[n],p[n]), alone
+    double reference; // U_ref, 0 while it is not known
+    double lastSubstep; // d of the last step; H if there was none since the state was changed
+    int64_t seed; // 0: there is none yet
+    int64_t numDrawn; // steps that have drawn noise
     Vectors givenNoise;
     long long numSubstepped;
     int largestSubsteps;
 
     // The step in progress.
     bool isInProgress;
-    bool isAtStart;                      // the solver is at q[n]
-    int doublings, substep;              // k and i
-    Vectors qNow, vNow, forceNow;        // at the beginning of a substep that is not the first
-    Vectors qMiddle, wMiddle, noForce;   // in the middle of the central drift
-    Vectors qNext, wNext, vNext;         // at its end, the velocities before the half kick and on step
+    bool isAtStart; // the solver is at q[n]
+    int doublings, substep; // k and i
+    Vectors qNow, vNow, forceNow; // at the beginning of a substep that is not the first
+    Vectors qMiddle, wMiddle, noForce; // in the middle of the central drift
+    Vectors qNext, wNext, vNext; // at its end, the velocities before the half kick and on step
+    Vectors netAccelerations; // M^-1 (F - G^T Lambda) where U was evaluated last
     ExpressionParameters thetaNow, thetaMiddle, thetaNext;
     std::vector<double> lambdaNow, lambdaNext, multipliers, noMultipliers, rightSide;
     std::vector<double> clusterSums; // A_c
-    double systemSize;                   // S
+    double systemSize; // S
 };
 
 } // namespace OpenMMVRattle

@@ -264,7 +264,7 @@ void testTriesAgainWithTheSameNoise() {
         const Vectors start = dynamics.getPositions(), velocities = dynamics.getVelocities();
         Vectors noise(start.size());
         for (size_t i = 0; i < noise.size(); i++)
-            noise[i] = RandomNumbers::normal(seed, 0, (uint32_t) i);
+            noise[i] = RandomNumbers::normal(seed, 0, (int) i);
         const int passes = takeStep(dynamics);
         const int substeps = dynamics.getLargestSubsteps();
         int k = 1;
@@ -287,6 +287,25 @@ void testRandomNumbers() {
             Words{0x408f276d, 0x41c83b0e, 0xa20bc7c6, 0x6d5451fd}));
     ASSERT((RandomNumbers::philox({0x243f6a88, 0x85a308d3, 0x13198a2e, 0x03707344}, {0xa4093822, 0x299f31d0}) ==
             Words{0xd16cfe09, 0x94fdcceb, 0x5001e420, 0x24126ea1}));
+    // Those of many particles at once, in any order, are those of each; and what logarithms and cosines of the library make of the words.
+    const uint64_t seed = 0x123456789abULL, step = 0x7654321fedcULL;
+    const int numParticles = 3 * RandomNumbers::BLOCK / 2;
+    vector<int> particles;
+    for (int i = 0; i < numParticles; i++)
+        particles.push_back(7 * (numParticles - i));
+    Vectors numbers(numParticles);
+    RandomNumbers::normal(seed, step, particles.data(), numParticles, numbers.data());
+    for (int i = 0; i < numParticles; i++) {
+        const Words words =
+            RandomNumbers::philox({(uint32_t) step, (uint32_t) (step >> 32), (uint32_t) particles[i], 0},
+                                  {(uint32_t) seed, (uint32_t) (seed >> 32)});
+        const double unit = std::pow(2.0, -32), turn = 8 * std::atan(1.0);
+        const double first = std::sqrt(-2 * std::log((words[0] + 0.5) * unit)), angle = turn * (words[1] * unit);
+        const double second = std::sqrt(-2 * std::log((words[2] + 0.5) * unit)), other = turn * (words[3] * unit);
+        const Vec3 expected(first * std::cos(angle), first * std::sin(angle), second * std::cos(other));
+        ASSERT((numbers[i] - expected).dot(numbers[i] - expected) < 1e-28);
+        ASSERT(numbers[i] == RandomNumbers::normal(seed, step, particles[i]));
+    }
     // Moments of the normal distribution, to five standard errors.
     const int count = 100000;
     double moments[4] = {}, product = 0;
