@@ -4,9 +4,16 @@
 ``--langevin`` one of VariableStepRattleLangevinIntegrator beside one of LangevinMiddleIntegrator.
 
 The integrators take turns, a few steps each, so that whatever else the machine does hits them alike; the cost is the
-ratio of neighbouring turns, its median and the range of its middle half. A table and one JSON line a ratio are printed.
+ratio of neighbouring turns, its median and the range of its middle half. The same ratio of the processor time of all
+threads depends less on what else there is to do. With ``--alone`` the systems have no nonbonded forces, so that the
+integrators' own work is most of what is left. A table and one JSON line a ratio are printed.
 
-    python benchmarks/overhead.py [--langevin] [--system water-6000 ...] [--platform CPU] [--rounds 15]
+    python benchmarks/overhead.py [--langevin] [--alone] [--system water-6000 ...] [--platform CPU] [--rounds 15]
+
+The cost of constant temperature in docs/langevin.md:
+
+    python benchmarks/overhead.py --langevin --system water-24000 villin-all-bonds villin-vacuum --rounds 300
+    python benchmarks/overhead.py --langevin --system water-24000 villin-all-bonds villin-vacuum --rounds 100 --alone
 """
 
 from __future__ import annotations
@@ -18,6 +25,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import openmm
 import rich.console
 import rich.table
@@ -49,14 +57,29 @@ def peptide() -> tuple[openmm.System, list]:
     return system, modeller.positions
 
 
-def protein() -> tuple[openmm.System, list]:
-    """Villin in water with PME; all its bonds are fixed, which makes one cluster of its 582 atoms."""
+def protein(in_water: bool = True) -> tuple[openmm.System, list]:
+    """Villin in water with PME, or alone; all its bonds are fixed, which makes one cluster of its 582 atoms."""
     pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
     field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    modeller = app.Modeller(pdb.topology, pdb.positions)
+    if not in_water:
+        modeller.delete([r for r in modeller.topology.residues() if len(list(r.atoms())) <= 3])  # waters and ions
     system = field.createSystem(
-        pdb.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9, constraints=app.AllBonds, rigidWater=True
+        modeller.topology,
+        nonbondedMethod=app.PME if in_water else app.NoCutoff,
+        nonbondedCutoff=0.9,
+        constraints=app.AllBonds,
+        rigidWater=True,
     )
-    return system, pdb.positions
+    return system, modeller.positions
+
+
+def without_nonbonded_forces(system: openmm.System) -> openmm.System:
+    """What is left of it holds molecules together."""
+    for i in reversed(range(system.getNumForces())):
+        if isinstance(system.getForce(i), openmm.NonbondedForce):
+            system.removeForce(i)
+    return system
 
 
 SYSTEMS: dict[str, Callable[[], tuple[openmm.System, list]]] = {
@@ -64,6 +87,7 @@ SYSTEMS: dict[str, Callable[[], tuple[openmm.System, list]]] = {
     "water-24000": lambda: water(6.25),
     "peptide-in-water": peptide,
     "villin-all-bonds": protein,
+    "villin-vacuum": lambda: protein(in_water=False),
 }
 
 
@@ -80,9 +104,18 @@ def integrators(langevin: bool) -> dict[str, openmm.Integrator]:
     return {"Verlet": verlet, "Explicit": explicit, "SemiExplicit": VariableStepRattleIntegrator(STEP)}
 
 
-def measure(name: str, platform: str, rounds: int, steps: int, threads: int | None, langevin: bool) -> list[dict]:
+def quartiles(seconds: list[float], base: list[float]) -> list[float]:
+    """Of the ratios of neighbouring turns."""
+    return np.quantile(np.array(seconds) / np.array(base), [0.25, 0.5, 0.75]).tolist()
+
+
+def measure(
+    name: str, platform: str, rounds: int, steps: int, threads: int | None, langevin: bool, alone: bool
+) -> list[dict]:
     """The steps per second of each integrator, and the ratio of its cost to that of OpenMM's."""
     system, positions = SYSTEMS[name]()
+    if alone:
+        system = without_nonbonded_forces(system)
     properties = {"Threads": str(threads)} if threads and platform == "CPU" else {}
     start = None
     runs = integrators(langevin)
@@ -101,28 +134,33 @@ def measure(name: str, platform: str, rounds: int, steps: int, threads: int | No
         integrator.step(steps)
         contexts[label] = context
     seconds: dict[str, list[float]] = {label: [] for label in runs}
+    processor: dict[str, list[float]] = {label: [] for label in runs}
     for turn in range(rounds):
         labels = list(runs)
         for label in labels[turn % len(labels) :] + labels[: turn % len(labels)]:
-            begin = time.perf_counter()
+            begin, begin_processor = time.perf_counter(), time.process_time()
             runs[label].step(steps)
             contexts[label].getState(energy=False)
             seconds[label].append((time.perf_counter() - begin) / steps)
+            processor[label].append((time.process_time() - begin_processor) / steps)
     results = []
     for label in runs:
-        ratios = sorted(a / b for a, b in zip(seconds[label], seconds[base], strict=True))
+        quarter, median, three_quarters = quartiles(seconds[label], seconds[base])
         result = {
             "benchmark": "overhead",
             "system": name,
+            "alone": alone,
             "atoms": system.getNumParticles(),
             "constraints": system.getNumConstraints(),
             "platform": platform,
             "integrator": label,
             "steps_per_second": 1 / statistics.median(seconds[label]),
-            "ratio": statistics.median(ratios),
+            "ratio": median,
             "ratio_of_best": min(seconds[label]) / min(seconds[base]),
-            "ratio_quarter": ratios[len(ratios) // 4],
-            "ratio_three_quarters": ratios[-1 - len(ratios) // 4],
+            "ratio_quarter": quarter,
+            "ratio_three_quarters": three_quarters,
+            "processor_ms": 1e3 * statistics.median(processor[label]),
+            "processor_ratio": quartiles(processor[label], processor[base])[1],
         }
         if label != base:
             result["solver_iterations_per_step"] = runs[label].getNumSolverIterations() / (steps * (rounds + 1))
@@ -134,18 +172,26 @@ def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--langevin", action="store_true", help="the integrators at constant temperature")
+    parser.add_argument("--alone", action="store_true", help="without nonbonded forces")
     parser.add_argument("--system", nargs="+", choices=list(SYSTEMS), default=list(SYSTEMS))
     parser.add_argument("--platform", default="CPU")
     parser.add_argument("--threads", type=int, help="threads of the CPU platform (default: OpenMM's choice)")
-    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--rounds", type=int, default=15, help="turns of each integrator")
     parser.add_argument("--steps", type=int, default=10, help="steps in a turn")
     arguments = parser.parse_args()
     table = rich.table.Table(title="Cost of a step beside that of OpenMM's integrator")
-    for column in ("system", "atoms", "integrator", "steps/s", "ratio", "middle half", "best/best"):
+    columns = ("system", "atoms", "integrator", "steps/s", "ratio", "middle half", "best/best", "processor ms", "ratio")
+    for column in columns:
         table.add_column(column)
     for name in arguments.system:
         for result in measure(
-            name, arguments.platform, arguments.rounds, arguments.steps, arguments.threads, arguments.langevin
+            name,
+            arguments.platform,
+            arguments.rounds,
+            arguments.steps,
+            arguments.threads,
+            arguments.langevin,
+            arguments.alone,
         ):
             print(json.dumps(result), flush=True)
             table.add_row(
@@ -156,8 +202,10 @@ def main() -> None:
                 f"{result['ratio']:.3f}",
                 f"{result['ratio_quarter']:.3f} to {result['ratio_three_quarters']:.3f}",
                 f"{result['ratio_of_best']:.3f}",
+                f"{result['processor_ms']:.2f}",
+                f"{result['processor_ratio']:.3f}",
             )
-    rich.console.Console().print(table)
+    rich.console.Console(width=120).print(table)
 
 
 if __name__ == "__main__":

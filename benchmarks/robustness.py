@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import datetime
 import functools
 import json
 import math
@@ -34,6 +35,8 @@ from openmmvrattle import VariableStepRattleLangevinIntegrator
 from openmmvrattle.testsystems import alanine_dipeptide, rigid_waters
 
 KT = 0.00831446261815324
+OXYGEN = 0.315061
+"""The diameter of an oxygen atom of TIP3P water, nm."""
 INTEGRATORS = {
     "ours": "this one",
     "LangevinMiddle": "`LangevinMiddleIntegrator`",
@@ -86,6 +89,7 @@ class Outcome:
     evaluations: float
     """A step, for ours."""
     seconds: float
+    date: str
 
 
 relaxed_waters = functools.cache(rigid_waters)
@@ -102,7 +106,7 @@ def waters_pushed_together(factor: float) -> Callable[[int], Start]:
         i, j = sorted(pairs, key=lambda pair: np.linalg.norm(oxygens[pair[0]] - oxygens[pair[1]]))[start - 1]
         direction = oxygens[j] - oxygens[i]
         distance = np.linalg.norm(direction)
-        positions[3 * j : 3 * j + 3] += (factor * 0.315061 / distance - 1) * direction
+        positions[3 * j : 3 * j + 3] += (factor * OXYGEN / distance - 1) * direction
         return waters.system, positions, np.array(waters.velocities)
 
     return make
@@ -363,7 +367,9 @@ def ROWS() -> dict[str, Row]:
         rows[name] = Row(vacuum_peptide, step, 20.0)
     rows["N2 gas at 2,000 K, 4 fs"] = Row(nitrogen_gas, 0.004, 4.0, temperature=2000)
     for name, constraints in (("all bonds rigid", app.AllBonds), ("HAngles", app.HAngles)):
-        rows[f"villin, {name}, hydrogens of 4 amu, 4 fs"] = Row(villin(constraints), 0.004, 1.0, platform="CPU")
+        rows[f"villin in vacuum, {name}, hydrogens of 4 amu, 4 fs"] = Row(
+            villin(constraints), 0.004, 1.0, platform="CPU"
+        )
     for speed in (10, 30, 60):
         name = f"chain of 127 and 1 amu by turns, thrown at a wall at {speed} km/s, 4 fs"
         rows[name] = Row(chain_on_a_wall(speed), 0.004, 10.0)
@@ -455,7 +461,8 @@ def run(name: str, row: Row, label: str, start: int) -> Outcome:
     evaluations = integrator.getNumForceEvaluations() / steps if label in ("ours", "control") else math.nan
     settings = [row.step, row.time, row.friction, row.temperature]
     peak = max(temperatures, default=math.nan)
-    return Outcome(name, label, start, settings, reason, mean, error, peak, evaluations, seconds)
+    today = datetime.date.today().isoformat()
+    return Outcome(name, label, start, settings, reason, mean, error, peak, evaluations, seconds, today)
 
 
 def judge(outcome: Outcome, control: Outcome) -> str:
@@ -492,8 +499,10 @@ def line_of(name: str, row: Row, labels: Sequence[str], starts: int, results: Re
     """The line of a table, and the first failure of each integrator."""
     control = results.get(name, row, "control", 1)
     cells, failures, evaluations, hot = [], [], "", ""
+    dates = {control.date}
     for label in labels:
         outcomes = [results.get(name, row, label, start) for start in range(1, starts + 1)]
+        dates |= {outcome.date for outcome in outcomes}
         reasons = [judge(outcome, control) for outcome in outcomes]
         good = [outcome for outcome, reason in zip(outcomes, reasons, strict=True) if not reason]
         cells.append(f"{len(good)}/{starts}")
@@ -503,7 +512,8 @@ def line_of(name: str, row: Row, labels: Sequence[str], starts: int, results: Re
             mean, error = np.mean([o.temperature for o in good]), good[0].error / math.sqrt(len(good))
             hot = f"{mean:.0f} ± {error:.0f}"
     limits = "-" if control.reason else f"{control.temperature:.0f} ± {control.error:.0f}"
-    return f"| {name} | {' | '.join([*cells, evaluations or '-', hot or '-', limits])} |", failures
+    measured = " to ".join(sorted({min(dates), max(dates)}))
+    return f"| {name} | {' | '.join([*cells, evaluations or '-', hot or '-', limits, measured])} |", failures
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -524,8 +534,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results = Results(options.output / "robustness.jsonl")
     names = [INTEGRATORS[label] for label in options.integrators]
     lines = [
-        f"| start, step | {' | '.join(names)} | evaluations a step | K at the end | control |",
-        "|---" * (len(names) + 4) + "|",
+        f"| start, step | {' | '.join(names)} | evaluations a step | K at the end | control | measured |",
+        "|---" * (len(names) + 5) + "|",
     ]
     failures = []
     print("\n".join(lines))

@@ -39,12 +39,17 @@ def test_constraints() -> None:
 
 @pytest.mark.parametrize(
     ("options", "integrators"),
-    [([], ["Verlet", "Explicit", "SemiExplicit"]), (["--langevin"], ["LangevinMiddle", "Langevin"])],
+    [
+        (["peptide-in-water"], ["Verlet", "Explicit", "SemiExplicit"]),
+        (["peptide-in-water", "--langevin"], ["LangevinMiddle", "Langevin"]),
+        (["villin-vacuum", "--langevin", "--alone"], ["LangevinMiddle", "Langevin"]),
+    ],
 )
 def test_overhead(options: list[str], integrators: list[str]) -> None:
-    results = run("overhead.py", "--system", "peptide-in-water", "--rounds", "1", "--steps", "1", *options)
+    results = run("overhead.py", "--rounds", "1", "--steps", "1", "--system", *options)
     assert [r["integrator"] for r in results] == integrators
     for result in results:
         assert result["ratio"] == pytest.approx(result["ratio_of_best"])  # of one round
         assert result["steps_per_second"] > 0
-        assert result["constraints"] > 2000
+        assert result["processor_ms"] > 0
+        assert result["constraints"] > 500

@@ -11,6 +11,7 @@ import copy
 import inspect
 import json
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -423,6 +424,42 @@ def test_a_failure_leaves_the_state() -> None:
     integrator.step(5)
 
 
+def test_a_failure_names_the_cluster() -> None:
+    """A chain so fast that its constraints have no solution: the exception has U, k and the particles of the chain."""
+    system, positions = molecules()
+    integrator = Langevin(300, 5, 0.004, randomNumberSeed=7)
+    integrator.setMaximumSubsteps(3)
+    context = open_context(system, integrator, positions)
+    integrator.step(2)
+    q, v = state_of(context)
+    time, count = context.getTime()._value, context.getStepCount()
+    reference = integrator.getReferenceMonitorValue()
+    v[4] += 2000 * np.cross(q[3] - q[4], q[5] - q[4]) / 0.01  # across the bonds
+    context.setVelocities(v)
+    value = integrator.getMonitorValue()
+    with pytest.raises(openmm.OpenMMException) as caught:
+        integrator.step(1)
+    message = str(caught.value)
+    print(message)
+    assert message.startswith(f"VariableStepRattleLangevinIntegrator: the step at t = {time:.10g} ps failed because ")
+    for words in (
+        "in a step of 3 substeps (k = 1)",
+        "the hardest being the cluster of the particles 3, 4 and 5",
+        "the Context is in the state before this step",
+    ):
+        assert words in message
+    told = re.search(r"the monitor U was (\S+) times its reference value", message)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(value / reference, rel=1e-4)
+    after = state_of(context)
+    assert np.array_equal(after[0], q)
+    assert np.array_equal(after[1], v)
+    assert (context.getTime()._value, context.getStepCount()) == (time, count)
+    assert integrator.getReferenceMonitorValue() == reference
+    context.setVelocitiesToTemperature(300, 1)
+    integrator.step(5)
+
+
 def test_forces_that_are_no_numbers_at_the_start() -> None:
     system, positions = molecules()
     force = openmm.CustomExternalForce("sqrt(-1 - x^2)")
@@ -645,21 +682,6 @@ def test_simulated_tempering() -> None:
         tempering.step(5)
         seen.add(round(integrator.getTemperature()._value))
     assert len(seen) > 1
-
-
-def test_metadynamics() -> None:
-    integrator = Langevin(300, 10, 0.002, randomNumberSeed=1)
-    sim = simulation(openmm.VerletIntegrator(0.001))
-    system = sim.system
-    distance = openmm.CustomBondForce("r")
-    distance.addBond(0, 3)
-    variable = app.BiasVariable(distance, 0.1, 1.5, 0.05, False)
-    metadynamics = app.Metadynamics(system, [variable], 300, 5, 1.0, 10)
-    again = app.Simulation(sim.topology, system, integrator, REFERENCE)
-    again.context.setPositions(sim.context.getState(positions=True).getPositions())
-    metadynamics.step(again, 50)
-    assert np.min(metadynamics.getFreeEnergy()._value) < -0.5
-    assert integrator.getNumForceEvaluations() >= 50
 
 
 def test_replica_exchange_and_expanded_ensemble() -> None:

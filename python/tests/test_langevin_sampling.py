@@ -19,7 +19,8 @@ from langevin_statement import BOLTZMANN
 from openmm import app, unit
 from openmmvrattle import VariableStepRattleLangevinIntegrator
 from openmmvrattle.testsystems import rigid_waters
-from run_support import degrees_of_freedom, relax, solvated
+from project_scripts import load_script
+from run_support import degrees_of_freedom, fastest_platform, relax, solvated
 
 KT = 300 * BOLTZMANN
 REFERENCE = openmm.Platform.getPlatform("Reference")
@@ -345,6 +346,152 @@ def test_replica_exchange_samples_each_temperature() -> None:
     replicas.simulate(500)
     assert_has_energies_of_temperatures("ReplicaExchangeSampler", energies, 60)
     assert len(states) == 6
+
+
+def test_metadynamics_finds_a_free_energy() -> None:
+    """Two wells, 5 kT deep: the bias of well-tempered metadynamics becomes what is known of the potential."""
+    width, depth, mass = 0.1, 5 * KT, 10.0
+    system, topology = openmm.System(), app.Topology()
+    system.addParticle(mass)
+    topology.addAtom("X", app.Element.getBySymbol("C"), topology.addResidue("X", topology.addChain()))
+    wells = openmm.CustomExternalForce("depth*((x/width)^2-1)^2 + 500*(y^2+z^2)")
+    wells.addGlobalParameter("depth", depth)
+    wells.addGlobalParameter("width", width)
+    wells.addParticle(0, [])
+    system.addForce(wells)
+    place = openmm.CustomExternalForce("x")
+    place.addParticle(0, [])
+    variable = app.BiasVariable(place, -2.5 * width, 2.5 * width, 0.15 * width, gridWidth=201)
+    metadynamics = app.Metadynamics(system, [variable], 300, 6, 0.1 * KT, 20)
+    integrator = VariableStepRattleLangevinIntegrator(300, 10, 0.01, randomNumberSeed=4)
+    simulation = app.Simulation(topology, system, integrator, REFERENCE)
+    simulation.context.setPositions([[width, 0, 0]])
+    simulation.context.setVelocitiesToTemperature(300, 4)
+    metadynamics.step(simulation, 120000)
+    x = np.linspace(variable.minValue, variable.maxValue, variable.gridWidth)
+    found = metadynamics.getFreeEnergy()._value / KT
+    expected = depth * ((x / width) ** 2 - 1) ** 2 / KT
+    near = np.abs(x) < 1.3 * width
+    difference = (found - expected)[near]
+    difference -= difference.mean()
+    print(f"largest error of the free energy {np.abs(difference).max():.2f} kT, mean {difference.std():.2f} kT")
+    assert difference.std() < 0.2
+    assert np.abs(difference).max() < 0.5
+    barrier = found[variable.gridWidth // 2] - found[near].min()
+    assert barrier == pytest.approx(5, abs=0.5)
+
+
+def dumbbells(number: int, spacing: float, repulsion: float) -> tuple[openmm.System, np.ndarray]:
+    """A gas of rigid pairs of atoms that repel each other; or do not, and it is an ideal one."""
+    system = openmm.System()
+    force = openmm.CustomNonbondedForce("epsilon*(1-r/0.4)^2*step(0.4-r)")
+    force.addGlobalParameter("epsilon", repulsion)
+    force.setNonbondedMethod(openmm.CustomNonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.4)
+    positions = []
+    side = round(number ** (1 / 3))
+    for k in np.ndindex(side, side, side):
+        for end in range(2):
+            system.addParticle(10.0)
+            force.addParticle([])
+            positions.append(spacing * np.array(k) + [0.1 * end, 0, 0])
+        i = system.getNumParticles() - 2
+        system.addConstraint(i, i + 1, 0.1)
+        force.addExclusion(i, i + 1)
+    system.addForce(force)
+    edge = side * spacing
+    system.setDefaultPeriodicBoxVectors([edge, 0, 0], [0, edge, 0], [0, 0, edge])
+    return system, np.array(positions)
+
+
+def volumes_at_constant_pressure(
+    integrator: openmm.Integrator, system: openmm.System, positions: np.ndarray, pressure: float, count: int
+) -> list[float]:
+    """nm^3, at a pressure in kJ/mol/nm^3, after each of some attempts to change it."""
+    to_bar = 16.60539  # 1 kJ/mol/nm^3
+    barostat = openmm.MonteCarloBarostat(pressure * to_bar, 300, 2)
+    barostat.setRandomNumberSeed(11)
+    system.addForce(barostat)
+    integrator.setRandomNumberSeed(12)
+    context = openmm.Context(system, integrator, REFERENCE)
+    context.setPositions(positions)
+    context.setVelocitiesToTemperature(300, 13)
+    integrator.step(2 * count // 10)
+    volumes = []
+    for _ in range(count):
+        integrator.step(2)
+        volumes.append(context.getState().getPeriodicBoxVolume()._value)
+    return volumes
+
+
+def test_volume_of_an_ideal_gas() -> None:
+    """N rigid molecules that know nothing of each other: the mean volume is (N + 1) kT/P."""
+    number, spacing = 27, 1.0
+    system, positions = dumbbells(number, spacing, repulsion=0)
+    pressure = (number + 1) * KT / (number * spacing**3)
+    integrator = VariableStepRattleLangevinIntegrator(300, 5, 0.004)
+    volumes = volumes_at_constant_pressure(integrator, system, positions, pressure, 5000)
+    assert_agrees("volume", blocks(volumes), (number + 1) * KT / pressure, 0.02)
+    spread = np.std(volumes) / (np.sqrt(number + 1) * KT / pressure)
+    print(f"spread {spread:.3f} of what it should be")
+    assert spread == pytest.approx(1, abs=0.1)
+
+
+def test_volume_of_a_gas_is_that_of_openmm() -> None:
+    """Molecules that repel each other, at a pressure where that counts for half of the volume."""
+    number, spacing, results = 27, 0.45, []
+    pressure = 2.5 * number * KT / (number * spacing**3)
+    for integrator in (
+        VariableStepRattleLangevinIntegrator(300, 5, 0.004),
+        openmm.LangevinMiddleIntegrator(300, 5, 0.004),
+    ):
+        system, positions = dumbbells(number, spacing, repulsion=20)
+        results.append(blocks(volumes_at_constant_pressure(integrator, system, positions, pressure, 3000)))
+    (mine, error), (other, other_error) = results
+    ideal = (number + 1) * KT / pressure
+    print(
+        f"{mine:.3f} +- {error:.3f}, LangevinMiddleIntegrator {other:.3f} +- {other_error:.3f}, ideal {ideal:.3f} nm^3"
+    )
+    assert np.hypot(error, other_error) < 0.015 * other
+    assert abs(mine - other) < 4 * np.hypot(error, other_error)
+    assert other > 1.3 * ideal
+
+
+@pytest.mark.claims
+def test_calm_water_has_no_substeps() -> None:
+    """A box of 216 waters at 2 fs: as many steps as take minutes; docs/langevin_benchmark.md has a million."""
+    modeller, force_field = solvated(count=216)
+    system = force_field.createSystem(modeller.topology, nonbondedMethod=app.CutoffPeriodic, nonbondedCutoff=0.8)
+    positions, velocities = relax(system, modeller.positions, steps=2000)
+    integrator = VariableStepRattleLangevinIntegrator(300, 1, 0.002, randomNumberSeed=6)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(fastest_platform()))
+    context.setPositions(positions.reshape(-1, 3))
+    context.setVelocities(velocities.reshape(-1, 3))
+    evaluations, steps, largest = integrator.getNumForceEvaluations(), 50000, 0.0
+    for _ in range(steps // 50):
+        integrator.step(50)
+        largest = max(largest, integrator.getMonitorValue() / integrator.getReferenceMonitorValue())
+    print(f"{steps} steps, of which {integrator.getNumSubstepped()} have substeps; U up to {largest:.2f} U_ref seen")
+    assert integrator.getNumSubstepped() == 0
+    assert integrator.getNumForceEvaluations() - evaluations <= steps + 1
+
+
+@pytest.mark.claims
+@pytest.mark.parametrize("from_rest", [False, True])
+def test_a_calm_peptide_takes_one_evaluation_a_step(from_rest: bool) -> None:
+    """Alanine dipeptide in water, minimised, at 2 fs, the start included."""
+    system, positions, _ = load_script("benchmarks/robustness.py").solvated_peptide(1)
+    integrator = VariableStepRattleLangevinIntegrator(300, 1, 0.002, randomNumberSeed=6)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(fastest_platform()))
+    context.setPositions(positions)
+    openmm.LocalEnergyMinimizer.minimize(context)
+    context.setVelocitiesToTemperature(0 if from_rest else 300, 6)
+    integrator.step(1)
+    evaluations, steps = integrator.getNumForceEvaluations(), 6000
+    integrator.step(steps)
+    each = (integrator.getNumForceEvaluations() - evaluations) / steps
+    print(f"{each:.5f} evaluations a step, {integrator.getNumSubstepped()} steps with substeps")
+    assert each <= 1.001
 
 
 @pytest.mark.claims
