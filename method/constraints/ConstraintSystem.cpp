@@ -39,25 +39,29 @@ void ConstraintSystem::writeParameters(int expression, const std::map<std::strin
         values[place++] = parameter.second;
 }
 
+// copy(in the order of the constructor, in the internal one) for each parameter
+template <class Copy> void ConstraintSystem::forParameters(const Copy& copy) const {
+    int given = 0;
+    for (size_t e = 0; e < expressions.size(); e++)
+        for (size_t i = 0; i < expressions[e].parameters.size(); i++)
+            copy(given++, firstParameters[e] + (int) i);
+}
+
 ExpressionParameters ConstraintSystem::toGivenOrder(const ExpressionParameters& theta) const {
     ExpressionParameters given = theta;
-    int next = 0;
-    for (size_t e = 0; e < expressions.size(); e++)
-        for (size_t i = 0; i < expressions[e].parameters.size(); i++, next++) {
-            given.values[next] = theta.values[firstParameters[e] + i];
-            given.rates[next] = theta.rates[firstParameters[e] + i];
-        }
+    forParameters([&](int to, int from) {
+        given.values[to] = theta.values[from];
+        given.rates[to] = theta.rates[from];
+    });
     return given;
 }
 
 ExpressionParameters ConstraintSystem::fromGivenOrder(const ExpressionParameters& given) const {
     ExpressionParameters theta = given;
-    int next = 0;
-    for (size_t e = 0; e < expressions.size(); e++)
-        for (size_t i = 0; i < expressions[e].parameters.size(); i++, next++) {
-            theta.values[firstParameters[e] + i] = given.values[next];
-            theta.rates[firstParameters[e] + i] = given.rates[next];
-        }
+    forParameters([&](int from, int to) {
+        theta.values[to] = given.values[from];
+        theta.rates[to] = given.rates[from];
+    });
     return theta;
 }
 
@@ -399,4 +403,11 @@ void ConstraintSystem::getGivenMultipliers(const vector<double>& multipliers, ve
     result.assign(numGivenConstraints, 0.0);
     for (int k = 0; k < getNumConstraints(); k++)
         result[givenIndex[k]] = multipliers[k] * multiplierFactors[k];
+}
+
+double ConstraintSystem::getExpressionMultiplier(int expression, const vector<double>& multipliers) const {
+    const auto isWanted = [&](const ExpressionRow& row) {
+        return givenIndex[row.constraint] == numGivenDistances + expression;
+    };
+    return multipliers[std::find_if(expressionRows.begin(), expressionRows.end(), isWanted)->constraint];
 }

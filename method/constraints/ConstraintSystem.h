@@ -297,6 +297,8 @@ public:
     }
     /** Bring multipliers into the order of the constructor, distances first, and into the users' units. */
     void getGivenMultipliers(const std::vector<double>& multipliers, std::vector<double>& result) const;
+    /** That of an expression, counted in the order of the constructor. */
+    double getExpressionMultiplier(int expression, const std::vector<double>& multipliers) const;
     /** Say in words what is wrong with a constraint whose gradient is zero or not finite; empty if neither is so. */
     std::string explainGradient(int index, const Jacobian& jacobian) const;
     /** Say in words, and with the way out, that positions are too large for the tolerance of a constraint; else empty. */
@@ -329,6 +331,7 @@ private:
     template <class Task> void forDistances(const Part& part, const Task& task) const;
     template <class Task> void forRows(const Part& part, const Task& task) const;
     template <class Task> void forGroups(const Part& part, const Task& task) const;
+    template <class Copy> void forParameters(const Copy& copy) const;
     const ExpressionRow& findRow(int constraint) const;
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;

@@ -108,30 +108,20 @@ template <class Method> void HostRunDevice<Method>::setSettings(const Integrator
     setMethod(from);
     forceGroups = from.getActingForceGroups();
     monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
-    HostRunDevice::setParameters(from.expressions);
 }
 
-template <class Method> void HostRunDevice<Method>::setParameters(const vector<ExpressionConstraint>& given) {
+template <class Method> bool HostRunDevice<Method>::setParameters(const vector<ExpressionConstraint>& given) {
+    bool areOthers = false;
     for (size_t i = 0; i < expressions.size(); i++)
         if (expressions[i].parameters != given[i].parameters) {
             expressions[i].parameters = given[i].parameters;
             method.setParameters((int) i, expressions[i].parameters);
+            areOthers = true;
         }
-}
-
-template <class Method> vector<double> HostRunDevice<Method>::getReferences() {
-    return method.getReferences();
-}
-
-template <class Method> void HostRunDevice<Method>::setReferences(const vector<double>& references) {
-    method.setReferences(references);
+    return areOthers;
 }
 
 // ------------------------------------------------------------------------------------------ what happens to the Context
-
-template <class Method> bool HostRunDevice<Method>::updateState() {
-    return vectors->updateState();
-}
 
 template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
     const Vec3* box = vectors->getBoxVectors();
@@ -363,9 +353,6 @@ template <class Method> void HostRunDevice<Method>::step(double maxTime) {
     ahead.reset();
 }
 
-template <class Method> void HostRunDevice<Method>::settle() {
-}
-
 // The positions of the Context before a step.
 template <class Method> void HostRunDevice<Method>::putBack() {
     if (ahead != nullptr) {
@@ -388,18 +375,6 @@ template <class Method> void HostRunDevice<Method>::reverse() {
         ahead->velocities = velocities;
 }
 
-template <class Method> RunDevice::LastStep HostRunDevice<Method>::getLastStep() {
-    return lastStep;
-}
-
-template <class Method> double HostRunDevice<Method>::getTime() {
-    return vectors->getTime();
-}
-
-template <class Method> long long HostRunDevice<Method>::getStepCount() {
-    return vectors->getStepCount();
-}
-
 // ------------------------------------------------------------------------------------------------------------- numbers
 
 template <class Method> vector<double> HostRunDevice<Method>::getMultipliers() {
@@ -408,9 +383,8 @@ template <class Method> vector<double> HostRunDevice<Method>::getMultipliers() {
     return result;
 }
 
-template <class Method> vector<double> HostRunDevice<Method>::getExpressionMultipliers() {
-    const vector<double> all = getMultipliers();
-    return vector<double>(all.end() - expressions.size(), all.end());
+template <class Method> double HostRunDevice<Method>::getExpressionMultiplier(int index) {
+    return method.getConstraintSystem().getExpressionMultiplier(index, method.getMultipliers());
 }
 
 template <class Method> double HostRunDevice<Method>::computeKineticEnergy() {
@@ -419,14 +393,6 @@ template <class Method> double HostRunDevice<Method>::computeKineticEnergy() {
         if (masses[i] > 0) // the velocities of the others have no meaning, and may be no numbers
             sum += masses[i] * vectors->getVelocities()[i].dot(vectors->getVelocities()[i]);
     return 0.5 * sum;
-}
-
-template <class Method> long long HostRunDevice<Method>::getNumForceEvaluations() {
-    return numForceEvaluations;
-}
-
-template <class Method> long long HostRunDevice<Method>::getNumSolverIterations() {
-    return method.getNumIterations();
 }
 
 // ------------------------------------------------------------------------------------------------- saving and resuming

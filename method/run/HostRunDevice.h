@@ -39,10 +39,16 @@ public:
         method.setParallel(parallel, numThreads);
     }
     void setSettings(const IntegratorSettings& settings) override;
-    void setParameters(const std::vector<ExpressionConstraint>& given) override;
-    std::vector<double> getReferences() override;
-    void setReferences(const std::vector<double>& references) override;
-    bool updateState() override;
+    bool setParameters(const std::vector<ExpressionConstraint>& given) override;
+    std::vector<double> getReferences() override {
+        return method.getReferences();
+    }
+    void setReferences(const std::vector<double>& references) override {
+        method.setReferences(references);
+    }
+    bool updateState() override {
+        return vectors->updateState();
+    }
     Change findChange() override;
     unsigned long long getFingerprint() override;
     unsigned long long getParameterFingerprint() override;
@@ -52,16 +58,27 @@ public:
     void writeVelocities() override;
     void changeForces() override;
     void step(double maxTime) override;
-    void settle() override;
+    void settle() override {
+    }
     void reverse() override;
-    LastStep getLastStep() override;
-    double getTime() override;
-    long long getStepCount() override;
+    LastStep getLastStep() override {
+        return lastStep;
+    }
+    double getTime() override {
+        return vectors->getTime();
+    }
+    long long getStepCount() override {
+        return vectors->getStepCount();
+    }
     std::vector<double> getMultipliers() override;
-    std::vector<double> getExpressionMultipliers() override;
+    double getExpressionMultiplier(int index) override;
     double computeKineticEnergy() override;
-    long long getNumForceEvaluations() override;
-    long long getNumSolverIterations() override;
+    long long getNumForceEvaluations() override {
+        return numForceEvaluations;
+    }
+    long long getNumSolverIterations() override {
+        return method.getNumIterations();
+    }
     void save(RunState& run) override;
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 

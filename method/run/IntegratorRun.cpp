@@ -106,17 +106,14 @@ bool IntegratorRun::canTakeSettings() const {
 
 // A run whose constraints move goes through here in each step.
 void IntegratorRun::takeParameters() {
-    if (areValuesChanged && !settings.hasSameParameters(applied.expressions)) {
-        try {
-            takeForcesOfOthers();
-            device.setParameters(settings.expressions);
-        }
-        catch (const StepFailure& failure) {
-            throw OpenMMException(getName() + ": " + failure.what());
-        }
-        for (size_t i = 0; i < settings.expressions.size(); i++)
-            applied.expressions[i].parameters = settings.expressions[i].parameters;
-        areParametersNew = true;
+    if (!areValuesChanged)
+        return;
+    try {
+        takeForcesOfOthers();
+        areParametersNew = device.setParameters(settings.expressions) || areParametersNew;
+    }
+    catch (const StepFailure& failure) {
+        throw OpenMMException(getName() + ": " + failure.what());
     }
     areValuesChanged = false;
 }
@@ -134,6 +131,7 @@ void IntegratorRun::takeSettings() {
     try {
         takeForcesOfOthers();
         device.setSettings(settings);
+        areParametersNew = device.setParameters(settings.expressions) || areParametersNew;
     }
     catch (const StepFailure& failure) {
         throw OpenMMException(getName() + ": " + failure.what());
@@ -143,7 +141,6 @@ void IntegratorRun::takeSettings() {
         (!settings.usesMonitorForceGroup() || settings.monitorForceGroup == applied.monitorForceGroup);
     if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups())
         task = Task::Start;
-    areParametersNew = areParametersNew || !settings.hasSameParameters(applied.expressions);
     // A start has met the tolerance that there was.
     if (isAtStart && settings.constraintTolerance != applied.constraintTolerance)
         task = Task::Start;
@@ -412,7 +409,7 @@ vector<double> IntegratorRun::getMultipliers() {
 
 double IntegratorRun::getExpressionMultiplier(int index) {
     prepare(false);
-    return device.getExpressionMultipliers().at(index);
+    return device.getExpressionMultiplier(index);
 }
 
 vector<double> IntegratorRun::getRandomState() {

@@ -77,9 +77,3 @@ bool IntegratorSettings::hasSameConstraints(const IntegratorSettings& other) con
     return std::equal(expressions.begin(), expressions.end(), other.expressions.begin(), other.expressions.end(),
                       haveSameParts);
 }
-
-bool IntegratorSettings::hasSameParameters(const std::vector<ExpressionConstraint>& others) const {
-    return std::equal(
-        expressions.begin(), expressions.end(), others.begin(), others.end(),
-        [](const ExpressionConstraint& a, const ExpressionConstraint& b) { return a.parameters == b.parameters; });
-}

@@ -89,8 +89,6 @@ struct IntegratorSettings {
     void requireConsistent() const;
     /** Whether both have the same constraints by expressions, but for the values of their parameters. */
     bool hasSameConstraints(const IntegratorSettings& other) const;
-    /** Whether the values of their parameters are the same as those of as many others. */
-    bool hasSameParameters(const std::vector<ExpressionConstraint>& others) const;
 };
 
 /** Whether two constraints are the same but for the values of their parameters. */

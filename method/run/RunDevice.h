@@ -42,13 +42,17 @@ public:
      * Take over settings, which are consistent (IntegratorSettings::isConsistent()) and have the constraints that the device was
      * made with. Called before anything is asked that depends on them, and again between steps when they have changed. In the
      * course of a run the density goes on where the new settings allow it: it is scaled with u = U/U_ref. The values of the
-     * parameters of expressions are those that the next step leads to; start() puts them in force at once.
+     * parameters of expressions are not among them.
      *
      * @throws StepFailure    if the System cannot have one of the monitors
      */
     virtual void setSettings(const IntegratorSettings& settings) = 0;
-    /** Take over other values of the parameters of expressions, and nothing else. */
-    virtual void setParameters(const std::vector<ExpressionConstraint>& given) = 0;
+    /**
+     * Take over the values of the parameters of expressions, which the next step leads to; start() puts them in force at once.
+     *
+     * @return whether any is another
+     */
+    virtual bool setParameters(const std::vector<ExpressionConstraint>& given) = 0;
     /** The reference values in force of the monitors, or of the two of automatic step control; 0 where there is none yet. */
     virtual std::vector<double> getReferences() = 0;
     /** Put reference values in force, as from a saved run or a trial run; 0 for those that are not known. */
@@ -162,8 +166,8 @@ public:
     virtual std::vector<double> getMonitorValues() = 0;
     /** Lambda(q[n],p[n]), for the System's constraints and behind them for the expressions, in the users' units. */
     virtual std::vector<double> getMultipliers() = 0;
-    /** Those of the expressions alone. */
-    virtual std::vector<double> getExpressionMultipliers() = 0;
+    /** That of one of the expressions alone. */
+    virtual double getExpressionMultiplier(int index) = 0;
     /** The kinetic energy of the Context's velocities (kJ/mol). */
     virtual double computeKineticEnergy() = 0;
     /** Whether the next step goes on with the forces that somebody else has computed, who is to compute them with each energy. */

@@ -123,7 +123,7 @@ void MonitorControl::solve() {
         // u(q[n],p[n-1/2]) are all scaled with what u becomes with the new velocities.
         if (solver.jump >= 0) {
             const double scale = monitor.combine(monitor.evaluateAt(now, solver.next.v, solver.motion.getJump())) / u;
-            if (std::isfinite(scale) && scale > 0 && std::fabs(scale - 1) > SMALL_JUMP)
+            if (std::isfinite(scale) && scale > 0 && std::fabs(scale - 1) > SMALL_CHANGE)
                 densityScale = scale;
         }
         bounded = recursion.boundedUpdate(densityScale * u, densityScale * rho);

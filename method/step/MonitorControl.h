@@ -13,7 +13,7 @@ namespace OpenMMVRattle {
 class MonitorControl : public StepControl {
 public:
     /** A relative change of u that starts no oscillation to speak of: to scale the density for it would only cost reversibility. */
-    static constexpr double SMALL_JUMP = 0.01;
+    static constexpr double SMALL_CHANGE = 0.01;
     MonitorControl(ConstraintSolver& constraints, StepSolver& solver, StepState& now);
     std::vector<double> getValues() const override {
         return now.values;

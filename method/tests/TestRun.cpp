@@ -20,6 +20,7 @@ namespace {
 class Recorder : public RunDevice {
 public:
     string calls;             // a letter for each, see below
+    double parameter = 0;     // of an expression, if there is one
     int failingStep = 0;      // counted from 1; 0 for none
     bool failsToStart = false;
     Change change = Change::None;
@@ -33,8 +34,12 @@ public:
         calls += 's';
         references.assign(settings.getNumReferences(), 0.0);
     }
-    void setParameters(const vector<ExpressionConstraint>&) override {
-        calls += 'p';
+    bool setParameters(const vector<ExpressionConstraint>& given) override {
+        const double before = parameter;
+        parameter = given.empty() ? 0.0 : given[0].parameters.at("d");
+        if (parameter != before)
+            calls += 'p';
+        return parameter != before;
     }
     vector<double> getReferences() override {
         look();
@@ -117,8 +122,8 @@ public:
         look();
         return {};
     }
-    vector<double> getExpressionMultipliers() override {
-        return getMultipliers();
+    double getExpressionMultiplier(int) override {
+        return 0;
     }
     double computeKineticEnergy() override {
         return 0;
@@ -251,7 +256,7 @@ void testParameters() {
     setParameter(5);
     run.settingsChanged(); // all of them, then
     run.step(2);
-    ASSERT_EQUAL(string("+.s++."), e.device.takeCalls());
+    ASSERT_EQUAL(string("+.sp++."), e.device.takeCalls());
     run.forcesChanged();
     run.step(2);
     run.getMultipliers();

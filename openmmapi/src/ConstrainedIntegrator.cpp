@@ -174,15 +174,19 @@ long long ConstrainedIntegrator::getNumSolverIterations() const {
 
 // ------------------------------------------------------------------------------------------ constraints by expressions
 
+void ConstrainedIntegrator::requireFiniteParameter(const string& expression, const string& name, double value) const {
+    if (!std::isfinite(value))
+        throw OpenMMException(getName() + ": the constraint \"" + expression + "\" has the parameter " + name +
+                              ", whose value is not a finite number");
+}
+
 void ConstrainedIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
                                             const std::map<string, double>& parameters) {
     const string constraint = getName() + ": the constraint \"" + expression + "\" ";
     vector<string> names;
     for (const auto& parameter : parameters) {
         names.push_back(parameter.first);
-        if (!std::isfinite(parameter.second))
-            throw OpenMMException(constraint + "has the parameter " + parameter.first +
-                                  ", whose value is not a finite number");
+        requireFiniteParameter(expression, parameter.first, parameter.second);
     }
     vector<int> sorted = particles;
     std::sort(sorted.begin(), sorted.end());
@@ -241,11 +245,15 @@ void ConstrainedIntegrator::setExpressionConstraintParameters(int index, const s
 
 void ConstrainedIntegrator::setExpressionParameterValue(int index, const string& name, double value) {
     checkExpressionConstraintIndex(index);
-    OpenMMVRattle::ExpressionConstraint changed = settings->expressions[index];
-    if (changed.parameters.count(name) == 0)
-        throw OpenMMException(getName() + ": the constraint \"" + changed.expression + "\" has no parameter " + name);
-    changed.parameters[name] = value;
-    setExpressionConstraintParameters(index, changed.expression, changed.particles, changed.parameters);
+    ExpressionConstraint& constraint = settings->expressions[index];
+    const auto parameter = constraint.parameters.find(name);
+    if (parameter == constraint.parameters.end())
+        throw OpenMMException(getName() + ": the constraint \"" + constraint.expression + "\" has no parameter " +
+                              name);
+    requireFiniteParameter(constraint.expression, name, value);
+    parameter->second = value;
+    if (run != nullptr)
+        run->parametersChanged();
 }
 
 double ConstrainedIntegrator::getExpressionConstraintMultiplier(int index) const {

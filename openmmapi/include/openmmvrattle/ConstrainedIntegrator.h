@@ -197,6 +197,7 @@ private:
     ConstrainedIntegrator(const ConstrainedIntegrator&) = delete;
     ConstrainedIntegrator& operator=(const ConstrainedIntegrator&) = delete;
     std::string getName() const;
+    void requireFiniteParameter(const std::string& expression, const std::string& name, double value) const;
     void checkConstraint(const std::string& expression, const std::vector<int>& particles,
                          const std::map<std::string, double>& parameters);
     void checkExpressionConstraintIndex(int index) const;

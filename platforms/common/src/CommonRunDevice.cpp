@@ -326,20 +326,19 @@ template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSe
                   << " is below what the precision of this Context allows; " << possible.constraintTolerance
                   << " is used" << std::endl;
     }
-    const bool areParametersOthers = !possible.hasSameParameters(expressions);
     Host::setSettings(possible);
     areSettingsOnDevice = false;
-    if (areParametersOthers)
-        tellOfParameters();
 }
 
 // The steps go on where they were.
-template <class Host> void CommonRunDevice<Host>::setParameters(const vector<ExpressionConstraint>& given) {
+template <class Host> bool CommonRunDevice<Host>::setParameters(const vector<ExpressionConstraint>& given) {
     settle();
     if (isOnDevice && !takesMovingParameters())
         takeToHost();
-    Host::setParameters(given);
-    tellOfParameters();
+    const bool areOthers = Host::setParameters(given);
+    if (areOthers)
+        tellOfParameters();
+    return areOthers;
 }
 
 template <class Host> void CommonRunDevice<Host>::setReferences(const vector<double>& references) {
@@ -529,9 +528,10 @@ template <class Host> vector<double> CommonRunDevice<Host>::getMultipliers() {
 }
 
 // Which a run that pulls asks for in each step.
-template <class Host> vector<double> CommonRunDevice<Host>::getExpressionMultipliers() {
+template <class Host> double CommonRunDevice<Host>::getExpressionMultiplier(int index) {
     settle();
-    return isOnDevice && hasBegun && !isOnHost ? steps->getExpressionMultipliers() : Host::getExpressionMultipliers();
+    const bool isOthers = isOnDevice && hasBegun && !isOnHost;
+    return isOthers ? steps->getExpressionMultipliers()[index] : Host::getExpressionMultiplier(index);
 }
 
 template <class Host> double CommonRunDevice<Host>::computeKineticEnergy() {

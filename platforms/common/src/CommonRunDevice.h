@@ -28,7 +28,7 @@ public:
     CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
                     const IntegratorSettings& settings);
     void setSettings(const IntegratorSettings& settings) override;
-    void setParameters(const std::vector<ExpressionConstraint>& given) override;
+    bool setParameters(const std::vector<ExpressionConstraint>& given) override;
     void setReferences(const std::vector<double>& references) override;
     bool updateState() override;
     RunDevice::Change findChange() override;
@@ -44,7 +44,7 @@ public:
     RunDevice::LastStep getLastStep() override;
     double getTime() override;
     std::vector<double> getMultipliers() override;
-    std::vector<double> getExpressionMultipliers() override;
+    double getExpressionMultiplier(int index) override;
     double computeKineticEnergy() override;
     bool usesForcesOfOthers() override {
         return true;
