@@ -861,15 +861,15 @@ std::string ConstraintSolver::explainFailure(const Trial& trial) {
     return explain(*q, *theta, acceleration, "");
 }
 
-std::string ConstraintSolver::explainForces(const Vectors& forces) const {
+UselessForces ConstraintSolver::explainForces(const Vectors& forces) const {
     auto square = [&](int i) { return forces[i].dot(forces[i]); };
     int worst = movingParticles[0];
     for (int i : movingParticles)
         if (std::isfinite(square(worst)) && !(square(i) <= square(worst)))
             worst = i;
     const bool isFinite = std::isfinite(forces[worst][0] + forces[worst][1] + forces[worst][2]);
-    return "the force on particle " + std::to_string(worst) +
-           (isFinite ? " is too large to compute with" : " is infinite or not a number");
+    return UselessForces("the force on particle " + std::to_string(worst) +
+                         (isFinite ? " is too large to compute with" : " is infinite or not a number"));
 }
 
 // The way out is for what has no explanation of its own.

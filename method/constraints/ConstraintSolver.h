@@ -216,8 +216,8 @@ public:
     /** Begin with a guess without that iteration. */
     void guess(const Trial& trial, const Guess& guess);
     std::string explainFailure(const Trial& trial);
-    /** Of forces whose squares have no finite sum: the particle that makes it so. */
-    std::string explainForces(const Vectors& forces) const;
+    /** Of forces whose squares have no finite sum: what to throw, with the particle that makes it so. */
+    UselessForces explainForces(const Vectors& forces) const;
 
     /** What (3.14) wants to know of a trial. */
     struct Coupled {

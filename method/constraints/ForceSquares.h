@@ -56,7 +56,7 @@ public:
         sum = sumOf(numBlocks, [&](int k) { return blockSums[k]; });
         sumOverMass = sumOf(numBlocks, [&](int k) { return blockSumsOverMass[k]; });
         if (!std::isfinite(sum))
-            throw StepFailure(solver.explainForces(newForces));
+            throw solver.explainForces(newForces);
     }
     double getSum() const {
         return sum;

@@ -26,6 +26,12 @@ public:
     }
 };
 
+/** The forces are none that anything can be computed with. */
+class UselessForces : public StepFailure {
+public:
+    using StepFailure::StepFailure;
+};
+
 /** The constraints among some particles depend on each other, so that their multipliers are not defined. */
 class DependentConstraints : public StepFailure {
 public:

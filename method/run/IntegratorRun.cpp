@@ -214,6 +214,10 @@ void IntegratorRun::fulfilTask() {
         task = Task::None;
         areForcesChanged = false;
     }
+    catch (const UselessForces& failure) {
+        throwFailure(settings, "the start", device.getTime(), failure.what(),
+                     "; set other positions or parameters, or minimise the energy first");
+    }
     catch (const StepFailure& failure) {
         throwFailure(settings, "the start", device.getTime(), failure.what(), "");
     }

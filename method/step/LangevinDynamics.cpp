@@ -230,7 +230,7 @@ void LangevinDynamics::settle() {
 // P v, Lambda and U at q.
 void LangevinDynamics::evaluateOnStep() {
     if (findNotFinite(force, solver.getMovingParticles()) >= 0)
-        throw StepFailure(solver.explainForces(force));
+        throw solver.explainForces(force);
     wNext = v;
     solver.moveTo(q, theta, force);
     solver.finish({q, wNext, force, theta, 0.0, v, lambda, rightSide, nullptr, &netAccelerations});
