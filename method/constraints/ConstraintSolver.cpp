@@ -484,6 +484,20 @@ void ConstraintSolver::findMultipliers(const Vectors& v, const ExpressionParamet
     matrix.solve(multipliers);
 }
 
+// Half of what it has more with twice the rates than with none, since it is a square function of them.
+void ConstraintSolver::findChangeWithRates(const Vectors& v, const ExpressionParameters& parameters,
+                                           vector<double>& result) const {
+    ExpressionParameters other = parameters;
+    for (double& rate : other.rates)
+        rate *= 2;
+    system.evaluateCurvature(*q, v, other, result);
+    other.isMoving = false;
+    vector<double> atRest(result.size());
+    system.evaluateCurvature(*q, v, other, atRest);
+    for (size_t k = 0; k < result.size(); k++)
+        result[k] = 0.5 * (result[k] - atRest[k]);
+}
+
 void ConstraintSolver::projectVelocities(Vectors& v) {
     ensureFactor(FullFactor);
     system.multiply(jacobian, v, correction);

@@ -155,6 +155,8 @@ public:
                          std::vector<double>& rightSide);
     /** v -= M^-1 G^T K^-1 G v, the nearest velocities along the constraints. */
     void projectVelocities(Vectors& v);
+    /** How K Lambda changes with the logarithm of the rates dtheta/dt, all of which grow by the same factor. */
+    void findChangeWithRates(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& result) const;
     /** result -= M^-1 G^T K^-1 (G v + dg/dtheta . dtheta/dt): what brings v to where parameters that move want it. */
     void addProjection(const Vectors& v, const ExpressionParameters& theta, Vectors& result);
     /** result += scale M^-1 G^T x */

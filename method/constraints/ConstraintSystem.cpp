@@ -80,17 +80,19 @@ void ConstraintSystem::findParameterChange(const vector<Vec3>& q, const Expressi
         change[i] = target[i] - theta.values[i];
     ExpressionParameters there = theta, along = theta;
     there.values = target;
-    along.rates = change;
-    along.isMoving = true;
-    vector<double> before(getNumConstraints()), after(getNumConstraints()), linear(getNumConstraints());
+    there.rates = along.rates = change;
+    there.isMoving = along.isMoving = true;
+    vector<double> before(getNumConstraints()), after(before), linear(before), linearThere(before);
     forGroups(ALL, [&](const ExpressionGroup& group, int first, int end) {
         group.evaluate(q, theta, before, first, end);
         group.evaluate(q, there, after, first, end);
         group.addParameterMotion(q, along, linear, first, end);
+        group.addParameterMotion(q, there, linearThere, first, end);
     });
     for (const ExpressionRow& row : expressionRows) {
         const double ratio = (after[row.constraint] - before[row.constraint]) / linear[row.constraint];
-        if (!(ratio < 0.5)) // which no curvature of g makes of a small change
+        // A period, after which g changes as before; the mere curvature of g would make it change the other way.
+        if (!(ratio < 0.5 && linearThere[row.constraint] / linear[row.constraint] > 0.5))
             continue;
         const int e = givenIndex[row.constraint] - numGivenDistances, first = firstParameters[e];
         for (size_t i = 0; i < expressions[e].parameters.size(); i++)

@@ -22,10 +22,6 @@ public:
     std::vector<double> target;
     /** Let theta be at rest, now and until another target is set. */
     void rest(ExpressionParameters& theta);
-    /** Whether they are. */
-    bool isAtRest(const ExpressionParameters& theta) const {
-        return target == theta.values && !theta.isMoving;
-    }
 
     /** A step goes from positions and parameters there to the target. */
     void prepare(const std::vector<OpenMM::Vec3>& q, const ExpressionParameters& theta);

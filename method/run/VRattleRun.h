@@ -136,10 +136,6 @@ public:
     void adopt(const Memory& memory);
     /** Put parameters that are set in force at once, before positions are projected and the run starts afresh with begin(). */
     void adoptParameters();
-    /** Whether the next step and the last one are steps at the same parameters. */
-    bool areParametersAtRest() const {
-        return solver.motion.isAtRest(now.theta);
-    }
     /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
     void setReferences(const std::vector<double>& references) {
         control->setReferences(references);

@@ -248,8 +248,17 @@ std::function<void()> LangevinDynamics::remember() {
 }
 
 void LangevinDynamics::adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
-                             double newReference, bool isFollowed, int64_t drawn) {
-    takeState(positions, velocities, forces, energy);
+                             const ExpressionParameters& parameters, double newReference, bool isFollowed,
+                             int64_t drawn) {
+    const ExpressionParameters before = theta;
+    theta = parameters;
+    try {
+        takeState(positions, velocities, forces, energy);
+    }
+    catch (...) {
+        theta = before;
+        throw;
+    }
     v = velocities; // which have been projected, and so changed in the last bits
     reference = newReference;
     numDrawn = drawn;

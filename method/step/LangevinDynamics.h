@@ -84,10 +84,6 @@ public:
     const ExpressionParameters& getParameters() const {
         return theta;
     }
-    /** Whether the parameters are the same in the last step and the next. */
-    bool areParametersAtRest() const {
-        return motion.isAtRest(theta);
-    }
     void adoptParameters();
     void setReferences(const std::vector<double>& references);
     std::vector<double> getReferences() const {
@@ -138,12 +134,13 @@ public:
     /**
      * Go on from the state that such steps of the size H have led to.
      *
+     * @param parameters    theta there, with the rates of the last step
      * @param isFollowed    U_ref has followed U there; else it does so now
      * @param drawn         steps that have drawn noise
      */
     void adopt(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
-               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, double newReference, bool isFollowed,
-               int64_t drawn);
+               const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const ExpressionParameters& parameters,
+               double newReference, bool isFollowed, int64_t drawn);
     /** How many steps have been made of substeps, and of how many at most. */
     long long getNumSubstepped() const {
         return numSubstepped;

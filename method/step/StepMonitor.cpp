@@ -264,8 +264,8 @@ double StepMonitor::combineUnbounded(const Values& of) const {
     return std::sqrt(sum / sumOfWeights);
 }
 
-void StepMonitor::evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
-                                   Vectors& gradient) {
+double StepMonitor::evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
+                                     Vectors& gradient) {
     const vector<double>& masses = system.getMasses();
     const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
     std::fill(gradient.begin(), gradient.end(), Vec3());
@@ -273,7 +273,7 @@ void StepMonitor::evaluateGradient(const StepState& state, const Vectors& v, con
     std::fill(toSolve.begin(), toSolve.end(), 0.0);
     std::fill(solved.begin(), solved.end(), 0.0);
     const double u = combineUnbounded(values);
-    double sumOfWeights = 0;
+    double sumOfWeights = 0, changeWithRates = 0;
     for (const Term& each : terms)
         sumOfWeights += each.weight * each.weight;
     for (size_t k = 0; k < terms.size(); k++) {
@@ -316,8 +316,13 @@ void StepMonitor::evaluateGradient(const StepState& state, const Vectors& v, con
         for (int j = 0; j < numConstraints; j++)
             solved[j] = 2 * (solved[j] + toSolve[j]);
         solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
+        if (theta.isMoving) {
+            solver.findChangeWithRates(v, theta, toSolve);
+            changeWithRates = 0.5 * sumOf(numConstraints, [&](int j) { return solved[j] * toSolve[j]; });
+        }
     }
     const double slope = bounds.limitDerivative(u);
     for (Vec3& each : gradient)
         each *= slope;
+    return changeWithRates * slope;
 }

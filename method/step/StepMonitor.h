@@ -92,9 +92,13 @@ public:
     double combine(const Values& of) const {
         return bounds.limit(combineUnbounded(of));
     }
-    /** du/dv at the trial that was evaluated last, with the chain rule through Lambda (Lemma 4.2). */
-    void evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
-                          Vectors& gradient);
+    /**
+     * du/dv at the trial that was evaluated last, with the chain rule through Lambda (Lemma 4.2).
+     *
+     * @return how u changes with the logarithm of the rates of parameters that move
+     */
+    double evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
+                            Vectors& gradient);
 
 private:
     /** Multipliers, and over each range of them the sums of Lambda_k (K Lambda)_k and of (d_k Lambda_k)^2 in users' units. */

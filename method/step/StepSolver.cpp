@@ -22,6 +22,8 @@ const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // The density equation (3.14) is solved to the tolerance of the constraints, but not closer than rounding of U allows; and
 // where strained, badly scaled constraints make that rounding larger, the second number counts.
 const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
+// Where parameters move: slopes of (3.14) that are believed, and how much of the density they must be seen over.
+const double SMALLEST_SLOPE = 0.1, LARGEST_SLOPE = 10, SLOPE_ROUNDING = 1e-11;
 
 double dot(const vector<double>& a, const vector<double>& b) {
     double sum = 0;
@@ -105,14 +107,15 @@ bool StepSolver::solve(StepMonitor& monitor, const DensityEquation& equation, do
 /*
  * In each pass lambda gets its chord update and rho+ that of Newton's iteration on F = rho+ + rho - u(q,p+) - u(q,p-), whose
  * derivative is 1 + (h/(2 rho+^2)) du/dp (F - G^T Lambda) along the constraints; what either update does to the other's equation is
- * of higher order in h and left to the next pass.
+ * of higher order in h and left to the next pass. Where parameters move, their rates are those of a step of rho+, which u may depend on as
+ * much as on anything; then the derivative is that between two passes, once lambda is known well enough.
  */
 bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext) {
     const double rho = equation.rho;
     rhoNext = equation.explicitValue + equation.offset;
     if (!(rhoNext > 0))
         return false;
-    double previous = std::numeric_limits<double>::infinity();
+    double previous = std::numeric_limits<double>::infinity(), lastDensity = 0, lastMismatch = 0;
     const double densityTolerance = std::max(REGULAR_MARGIN * tolerance, DENSITY_ROUNDING);
     for (int pass = 0; pass <= MAX_COUPLED_PASSES; pass++) {
         const ConstraintSolver::Trial trial = trialTo(0.5 * h * (1 / rho + 1 / rhoNext), h / rhoNext, now.w);
@@ -127,7 +130,16 @@ bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equat
         if (!std::isfinite(error) || error > SLOW_COUPLED_CONVERGENCE * previous)
             return false;
         previous = error;
-        rhoNext -= mismatch / (1 + 0.5 * h * equation.rate / (rhoNext * rhoNext));
+        double slope = 1 + 0.5 * h * equation.rate / (rhoNext * rhoNext);
+        const double last = rhoNext;
+        if (motion.isMoving() && pass > 1 && std::fabs(rhoNext - lastDensity) > SLOPE_ROUNDING * rhoNext) {
+            const double secant = (mismatch - lastMismatch) / (rhoNext - lastDensity);
+            if (secant > SMALLEST_SLOPE && secant < LARGEST_SLOPE)
+                slope = secant;
+        }
+        rhoNext -= mismatch / slope;
+        lastDensity = last;
+        lastMismatch = mismatch;
         if (!(rhoNext > 0))
             return false;
     }
@@ -162,11 +174,11 @@ bool StepSolver::solveByNewton(StepMonitor& monitor, const DensityEquation& equa
         if (!constraints.linearize(trial))
             return false;
         // a = dF/dlambda, d = dF/drho+, and response = x2 = A^-1 dg/drho+
-        monitor.evaluateGradient(now, next.w, theta, gradient);
+        const double changeWithRates = monitor.evaluateGradient(now, next.w, theta, gradient);
         constraints.multiplyOverMass(gradient, coupling);
         for (double& a : coupling)
             a *= kick;
-        double d = 1;
+        double d = 1 - changeWithRates / rhoNext; // the rates are those of a step of this density
         const double kickChange = -0.5 * h / (rhoNext * rhoNext); // d(kick)/d(rho+)
         for (int i : constraints.getMovingParticles()) {
             const Vec3 kickPart = (next.w[i] - now.w[i]) * (kickChange / kick); // of dw+/drho+
@@ -175,7 +187,11 @@ bool StepSolver::solveByNewton(StepMonitor& monitor, const DensityEquation& equa
         }
         constraints.findResponse(trial, halfStepChange, response);
         constraints.findUpdate(trial, correction); // x1 = -A^-1 g
-        double change = (-mismatch - dot(coupling, correction)) / (d - dot(coupling, response));
+        double slope = d - dot(coupling, response);
+        // Where rates grow with the density u can do so faster than the density. Then the mismatch says where to go, as on GPUs.
+        if (theta.isMoving && !(slope > SMALLEST_SLOPE))
+            slope = 1;
+        double change = (-mismatch - dot(coupling, correction)) / slope;
         if (!std::isfinite(change))
             return false;
         // Within a factor of 4 at a time: far away (3.14) has solutions of no meaning.

@@ -61,20 +61,26 @@ public:
     vector<Vec3> gradient(const vector<Vec3>& v) {
         u(v);
         vector<Vec3> result(v.size());
-        monitor.evaluateGradient(state, v, state.theta, result);
+        changeWithRates = monitor.evaluateGradient(state, v, state.theta, result);
         return result;
     }
     ConstraintSolver solver;
     StepState state;
     StepMonitor monitor;
     vector<double> values;
+    double changeWithRates = 0;
 };
 
 static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
-                          const vector<ExpressionConstraint>& expressions = {}, const StepDensity& bounds = {}) {
+                          const vector<ExpressionConstraint>& expressions = {}, const StepDensity& bounds = {},
+                          double rate = 0) {
     Example e;
     e.expressions = expressions;
     Evaluation evaluation(e, terms, order, bounds);
+    vector<double>& rates = evaluation.state.theta.rates;
+    evaluation.state.theta.isMoving = rate != 0;
+    for (size_t k = 0; k < rates.size(); k++)
+        rates[k] = rate * (1 + 0.3 * (double) k);
     vector<Vec3> gradient = evaluation.gradient(e.velocities);
     double largest = 0;
     for (const Vec3& g : gradient)
@@ -89,6 +95,18 @@ static void checkGradient(const vector<StepMonitor::Term>& terms, double order,
             double difference = (evaluation.u(plus) - evaluation.u(minus)) / (2 * h);
             ASSERT(std::fabs(difference - gradient[i][j]) <= 1e-6 * largest);
         }
+    if (rate == 0)
+        return;
+    const vector<double> given = rates;
+    double uAt[2];
+    for (int side = 0; side < 2; side++) {
+        for (size_t k = 0; k < rates.size(); k++)
+            rates[k] = given[k] * (side == 0 ? 1 - h : 1 + h);
+        uAt[side] = evaluation.u(e.velocities);
+    }
+    const double difference = (uAt[1] - uAt[0]) / (2 * h), u = evaluation.u(e.velocities);
+    ASSERT(std::fabs(difference - evaluation.changeWithRates) <= 1e-6 * u);
+    ASSERT(std::fabs(difference) > 1e-3 * u || !StepMonitor::needConstraints(terms));
 }
 
 void testGradients() {
@@ -104,6 +122,16 @@ void testGradientsWithExpressions() {
                                                       {"exp(x1)*sqrt(1+y1^2)-z1", {4}, {}}};
     for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
         checkGradient({{(StepMonitor::Kind) kind, 1.0, 0.5, 700.0}}, 8, expressions);
+}
+
+// The rates of parameters count as velocities do.
+void testGradientsWithMovingParameters() {
+    const vector<ExpressionConstraint> expressions = {
+        {"sin(3*d*x1)*y2+z1*z2^2-d^2+e*y1", {5, 0}, {{"d", 0.8}, {"e", 0.3}}},
+        {"exp(c*x1)*sqrt(1+y1^2)-z1", {4}, {{"c", 1.1}}}};
+    for (int kind = StepMonitor::ConstraintMultipliers; kind <= StepMonitor::ForceGroupEnergy; kind++)
+        checkGradient({{(StepMonitor::Kind) kind, 1.0, 0.5, 700.0}}, 8, expressions,
+                      StepDensity(StepDensity::SemiExplicit, 1.0, 0.05, 3.0), 4.0);
 }
 
 void testCombinationGradient() {
@@ -196,6 +224,7 @@ int main() {
     return runTests({
         {"du/dv of every monitor against differences", testGradients},
         {"du/dv with expressions among the constraints", testGradientsWithExpressions},
+        {"du/dv and the rates of parameters", testGradientsWithMovingParameters},
         {"du/dv of a combination against differences", testCombinationGradient},
         {"the combination is normalised term by term", testCombination},
         {"multipliers that are rounding are noticed", testNegligibleMultipliers},

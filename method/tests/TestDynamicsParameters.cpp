@@ -417,6 +417,54 @@ void testEquations(StepDensity::Update update) {
     }
 }
 
+// The step in which a pivot begins to move, gently and so fast that u grows 600 times: (3.14) stated for this bead alone, with (3.11) solved
+// by a square root. Its solution is the next one from the density of (3.15), in the direction of the mismatch there.
+void testSuddenStart() {
+    const double mass = 2, h = 0.004, radius = 1;
+    const Vec3 weight(0, 0, -9.8 * mass);
+    const StepDensity bounds(StepDensity::SemiExplicit, h, h / 50, 2 * h);
+    for (double way : {0.001, -0.004, 0.006, -0.01, 0.02, -0.03, 0.1}) {
+        VRattleRun dynamics({mass}, {}, {{SPHERE, {0}, {{"px", 0}, {"py", 0}, {"pz", 0}, {"r", radius}}}});
+        StepSettings settings = variableSteps(h, StepDensity::SemiExplicit, StepMonitor::ConstraintForce);
+        settings.minimumStep = h / 50;
+        settings.maximumStep = 2 * h;
+        dynamics.setSettings(settings);
+        const ForceField field = [&](const Vectors&) { return Vectors{weight}; };
+        dynamics.begin({Vec3(0.8, 0, -0.6)}, {Vec3(0.3, 1, 0.4)}, field({}), 0);
+        for (int step = 0; step < 5; step++)
+            takeStep(dynamics, field);
+        const Vec3 q = dynamics.getPositions()[0], v = dynamics.getVelocities()[0], pivot(0, way, 0);
+        const Vec3 w = dynamics.keep().state.w[0];
+        const double rho = dynamics.getDensity(), reference = dynamics.getReferences()[0];
+        auto uOf = [&](const Vec3& velocity, const Vec3& rate) { // B(|Lambda^T K Lambda|^(1/2)/U_ref)
+            const Vec3 relative = velocity - rate;
+            const double acceleration = relative.dot(relative) / radius + weight.dot(q) / (mass * radius);
+            return bounds.limit(std::fabs(acceleration) * std::sqrt(mass) / reference);
+        };
+        const Vec3 startRate = pivot * (rho / h);
+        const double u = uOf(v, Vec3()), jump = uOf(v + q * (startRate.dot(q)), startRate) / u;
+        const double scale = std::fabs(jump - 1) > MonitorControl::SMALL_CHANGE ? jump : 1;
+        auto mismatch = [&](double next) {
+            const double kick = 0.5 * h * (1 / rho + 1 / next), drift = h / next;
+            const Vec3 free = w + weight * (kick / mass), from = q + free * drift - pivot;
+            const double along = from.dot(q);
+            const double push = along - std::sqrt(along * along - from.dot(from) + radius * radius);
+            return next - uOf(free - q * (push / drift), pivot / drift) + scale * (rho - uOf(w, Vec3()));
+        };
+        double expected = scale * StepDensity::sumUpdate(u, rho);
+        const double direction = mismatch(expected) > 0 ? -1 : 1, stride = 1e-3 * expected;
+        while (mismatch(expected + direction * stride) * direction < 0)
+            expected += direction * stride;
+        double low = expected, high = expected + direction * stride;
+        for (int i = 0; i < 60; i++)
+            (mismatch(0.5 * (low + high)) * direction < 0 ? low : high) = 0.5 * (low + high);
+        dynamics.setParameters(0, {{"px", 0}, {"py", way}, {"pz", 0}, {"r", radius}});
+        takeStep(dynamics, field);
+        assertNear(low, dynamics.getDensity(), 1e-9 * low, "density after a way of " + std::to_string(way));
+        ASSERT_EQUAL(0, dynamics.getNumRescues());
+    }
+}
+
 // A cut cluster beside batches, and any number of threads.
 void testManyThreads() {
     Example e;
@@ -669,6 +717,7 @@ int main() {
     tests.emplace_back("start of motion, automatic", [=] { testDensityAtStartOfMotion(automaticRing); });
     tests.emplace_back("changed forces, fixed", [] { testChangedForces(fixedSteps(0.002)); });
     tests.emplace_back("changed forces, automatic", [=] { testChangedForces(automatic); });
+    tests.emplace_back("sudden start", testSuddenStart);
     tests.emplace_back("threads", testManyThreads);
     tests.emplace_back("reverse, moving", [] { testReverse(true); });
     tests.emplace_back("reverse, standing", [] { testReverse(false); });

@@ -7,7 +7,7 @@ using namespace OpenMMVRattle;
 using std::vector;
 
 bool CommonLangevinDevice::canGoOnDevice() {
-    return langevin.areParametersAtRest() && langevin.isCalm();
+    return langevin.isCalm();
 }
 
 DeviceSteps::Settings CommonLangevinDevice::makeDeviceSettings() {
@@ -32,8 +32,8 @@ DeviceSteps::State CommonLangevinDevice::makeDeviceState() {
 }
 
 void CommonLangevinDevice::adopt(const State& state, const DeviceSteps::State& others) {
-    langevin.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, others.reference,
-                   others.isFollowed, others.numDrawn);
+    langevin.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, getDeviceParameters(),
+                   others.reference, others.isFollowed, others.numDrawn);
 }
 
 void CommonLangevinDevice::carryOn(const DeviceSteps::State& others) {

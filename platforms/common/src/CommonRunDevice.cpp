@@ -293,6 +293,7 @@ template <class Host> void CommonRunDevice<Host>::settle() {
         context.computeVirtualSites();
         takeToHost();
         Host::step(lastMaxTime);
+        hasStepped = false;
         for (int i = report.numSteps + 1; i < asked; i++) {
             repeatActions();
             step(NO_LIMIT);
@@ -333,8 +334,6 @@ template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSe
 // The steps go on where they were.
 template <class Host> bool CommonRunDevice<Host>::setParameters(const vector<ExpressionConstraint>& given) {
     settle();
-    if (isOnDevice && !takesMovingParameters())
-        takeToHost();
     const bool areOthers = Host::setParameters(given);
     if (areOthers)
         tellOfParameters();

@@ -73,10 +73,6 @@ protected:
     bool differ(const Vectors& a, const Vectors& b) override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
-    /** Whether the kernels of the steps in force know parameters of expressions that move. */
-    virtual bool takesMovingParameters() {
-        return false;
-    }
     /** The settings in force, for the GPU. */
     virtual DeviceSteps::Settings makeDeviceSettings() = 0;
     /** What there is of the host's state beside positions, velocities and forces. */

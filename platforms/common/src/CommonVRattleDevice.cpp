@@ -24,14 +24,9 @@ CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::C
 bool CommonVRattleDevice::canGoOnDevice() {
     const vector<double> references = vrattle.getReferences();
     // Automatic step control finds its references on the way.
-    return vrattle.hasStarted() && (takesMovingParameters() || vrattle.areParametersAtRest()) &&
+    return vrattle.hasStarted() &&
            (settings.isAutomatic ||
             std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
-}
-
-// With automatic step control the densities start anew where they begin to move, or stop.
-bool CommonVRattleDevice::takesMovingParameters() {
-    return !settings.isAutomatic;
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {

@@ -23,7 +23,6 @@ public:
 
 protected:
     bool canGoOnDevice() override;
-    bool takesMovingParameters() override;
     DeviceSteps::Settings makeDeviceSettings() override;
     DeviceSteps::State makeDeviceState() override;
     void adopt(const State& state, const DeviceSteps::State& others) override;

@@ -269,7 +269,7 @@ void DeviceSteps::compile(StepProgram::Update update) {
             setLargeArguments(created);
         if (expressions) {
             created.expressions = expressions->create(
-                text, program->hasHalfSums(), program->hasJumps(),
+                text, program->hasHalfSums(), program->hasJumps(), program->hasMiddle(),
                 {settingsArray, partials, jumpPartials, failure, oldPositions, oldVelocities, numGroups, numPartials});
             addLastState(created.expressions.finish);
             addNoiseState(created.expressions.advance);
@@ -576,7 +576,8 @@ void DeviceSteps::clearFailure() {
 // Parameters that move, or have moved and stop, come first.
 void DeviceSteps::beginExpressionStep() {
     expressions->beginStep();
-    if (!expressions->areParametersMoving())
+    const bool areJumpsDue = expressions->haveParametersMoved() && kernels.expressions.judge;
+    if (!expressions->areParametersMoving() && !areJumpsDue)
         return;
     expressions->launchMove(kernels.expressions, stepNumber, control[half]);
     numLaunches++;

@@ -40,17 +40,17 @@ void ExpressionSteps::initialize(bool isMixedPrecision) {
     clear(shifts, cells.size(), mixedSize, "vrattleShifts");
     clear(multipliers, clusters.getNumConstraints(), mixedSize, "vrattlePartMultipliers");
     clear(iterations, getNumParts(), 4, "vrattlePartIterations");
-    for (ComputeArray& array : parameters) {
-        clear(array, clusters.getParameters().size(), mixedSize, "vrattleParameters");
+    for (ComputeArray* array : {&parameters[0], &parameters[1], &middle}) {
+        clear(*array, clusters.getParameters().size(), mixedSize, "vrattleParameters");
         if (!clusters.getParameters().empty())
-            array.upload(clusters.getParameters(), true);
+            array->upload(clusters.getParameters(), true);
     }
     clear(jumpRates, clusters.getNumParameters(), mixedSize, "vrattleJumpRates");
     clear(hasJumped, 1, 4, "vrattleHasJumped");
 }
 
 ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program, bool hasHalfSums, bool hasJumps,
-                                                 const Arrays& arrays) {
+                                                 bool hasMiddle, const Arrays& arrays) {
     // The arguments in the order of kernels/expression.cc; empty ones change from launch to launch.
     auto addEmpty = [](ComputeKernel& kernel, int count) {
         for (int i = 0; i < count; i++)
@@ -74,6 +74,8 @@ ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program,
     kernels.advance->addArg(arrays.oldPositions);
     kernels.advance->addArg(arrays.oldVelocities);
     addParts(kernels.advance, arrays);
+    kernels.hasMiddle = hasMiddle;
+    addEmpty(kernels.advance, hasMiddle ? 1 : 0); // the parameters there
     kernels.move = program->createKernel("moveExpressions");
     addEmpty(kernels.move, 3); // step, wereMoving, control
     kernels.move->addArg(arrays.settings);
@@ -82,6 +84,7 @@ ExpressionSteps::Kernels ExpressionSteps::create(OpenMM::ComputeProgram program,
     kernels.move->addArg(jumpRates);
     kernels.move->addArg(hasJumped);
     addEmpty(kernels.move, 1); // changedParameters
+    kernels.move->addArg(middle);
     addParts(kernels.move, arrays);
     if (!hasJumps)
         return kernels;
@@ -268,6 +271,8 @@ void ExpressionSteps::launchAdvance(Kernels& kernels, int step, double tolerance
     setMixed(kernels.advance, 1, tolerance);
     kernels.advance->setArg(2, nextControl);
     setPlaces(kernels.advance, 5, from);
+    if (kernels.hasMiddle)
+        kernels.advance->setArg(5 + NUM_PART_ARGUMENTS, place.isMoving ? middle : parameters[place.side]);
     launch(kernels.advance);
 }
 
@@ -277,7 +282,7 @@ void ExpressionSteps::launchMove(Kernels& kernels, int step, ComputeArray& contr
     kernels.move->setArg(1, (int) wereMoving);
     kernels.move->setArg(2, control);
     kernels.move->setArg(8, parameters[place.side]);
-    setPlaces(kernels.move, 9, from);
+    setPlaces(kernels.move, 10, from);
     launch(kernels.move);
 }
 

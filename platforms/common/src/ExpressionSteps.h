@@ -21,6 +21,7 @@ class ExpressionSteps {
 public:
     struct Kernels {
         OpenMM::ComputeKernel finish, trial, advance, move, judge;
+        bool hasMiddle = false; // advance wants the parameters in the middle of the step
     };
     /** Where parts leave their sums, and what failures and settings are in; other sums are those of velocities that jump. */
     struct Arrays {
@@ -40,7 +41,8 @@ public:
         return numThreads;
     }
     void initialize(bool isMixed);
-    Kernels create(OpenMM::ComputeProgram program, bool hasHalfSums, bool hasJumps, const Arrays& arrays);
+    Kernels create(OpenMM::ComputeProgram program, bool hasHalfSums, bool hasJumps, bool hasMiddle,
+                   const Arrays& arrays);
 
     /** Take over theta[n] and the rates of the step that has led there, as of one of that size. */
     void setParameters(const ExpressionParameters& parameters, double stepSize);
@@ -52,9 +54,13 @@ public:
     void endSteps(int numCompleted);
     /** theta[n], and the rates of a last step of that size. Waits for the device if they are not zero. */
     ExpressionParameters getParameters(double stepSize);
-    /** Whether they move in the step that has begun, or have moved in the one before. */
+    /** Whether they move in the step that has begun, */
     bool areParametersMoving() const {
-        return place.isMoving || wereMoving;
+        return place.isMoving;
+    }
+    /** or have moved in the one before. */
+    bool haveParametersMoved() const {
+        return wereMoving;
     }
     /** The number of times that parameters have been uploaded. */
     long long getNumUploads() const {
@@ -100,7 +106,8 @@ private:
     int numBegun;
     bool hasMoved;
     long long numUploads;
-    OpenMM::ComputeArray parts, tables, work, shifts, multipliers, iterations, parameters[2], jumpRates, hasJumped;
+    OpenMM::ComputeArray parts, tables, work, shifts, multipliers, iterations, parameters[2], middle, jumpRates,
+        hasJumped;
 };
 
 } // namespace OpenMMVRattle

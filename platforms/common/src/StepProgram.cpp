@@ -433,6 +433,8 @@ void StepProgram::writeAutomaticControl(int numPieces) {
                                       {"FIRST_REFERENCE", Control::FirstReference},
                                       {"FIRST_NUMBER", Control::FirstNumber},
                                       {"IS_ACCEPTED", Control::IsAccepted},
+                                      {"IS_JUMP", Control::IsJump},
+                                      {"IS_JUMP_AHEAD", Control::IsJumpAhead},
                                       {"ALL_CHANGED", Control::AllChanged},
                                       {"VELOCITIES_CHANGED", Control::VelocitiesChanged},
                                       {"FORCES_CHANGED", Control::ForcesChanged}};
@@ -454,4 +456,5 @@ void StepProgram::writeExpressions(const ExpressionClusters& expressions) {
     defines["MAX_PART_ITERATIONS"] = to_string(MAX_PART_ITERATIONS);
     defines["SUDDEN_CHANGE"] = to_string(ParameterMotion::SUDDEN_CHANGE) + "f";
     defines["SMALL_JUMP"] = to_string(MonitorControl::SMALL_CHANGE) + "f";
+    defines["SMALL_JUMP_OF_ENERGY"] = literal(ParameterMotion::SMALL_JUMP) + "f";
 }

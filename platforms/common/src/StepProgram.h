@@ -41,7 +41,9 @@ enum Field {
 /** With automatic step control other numbers follow, and a word whether they are those at the end of the last step. */
 const int NumAutomaticNumbers = sizeof(AutomaticRecursions::AutomaticNumbers) / sizeof(double);
 const int FirstReference = FirstValue, FirstNumber = FirstReference + AutomaticControl::NUM_MONITORS;
-const int IsAccepted = FirstNumber + NumAutomaticNumbers, AutomaticSize = IsAccepted + 1;
+const int IsAccepted = FirstNumber + NumAutomaticNumbers;
+/** Whether velocities have jumped in the last step, or will in the next, since parameters of expressions begin to move, or stop. */
+const int IsJump = IsAccepted + 1, IsJumpAhead = IsJump + 1, AutomaticSize = IsJumpAhead + 1;
 /**
  * The settings; the weight, the power and the reference value of each monitor follow, or with automatic step control the choices of its
  * recursions, and 1/f, by which twice the kinetic energy is multiplied.
@@ -130,9 +132,13 @@ public:
     bool hasHalfSums() const {
         return update == SemiExplicit;
     }
-    /** Whether the density follows monitors that others may be scaled with. */
+    /** Whether the density follows monitors, which jump where parameters of expressions begin to move, or stop. */
     bool hasJumps() const {
-        return update == Sum || update == Bounded || update == SemiExplicit;
+        return update != Fixed && update != Langevin;
+    }
+    /** Whether parameters are wanted in the middle of a step too. */
+    bool hasMiddle() const {
+        return update == Langevin;
     }
     /** Words of the control block and of the settings. */
     int getControlSize() const {

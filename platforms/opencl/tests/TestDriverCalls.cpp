@@ -180,8 +180,6 @@ void testBarostat() {
 // one small download.
 void testTraffic() {
     for (const auto& choice : allChoices()) {
-        if (choice.first == "automatic")
-            continue;
         MovingRun run(choice.second);
         run.step(1);
         const int count = 20;
@@ -210,6 +208,57 @@ void testTraffic() {
         ASSERT_EQUAL(0, multiplier.uploads);
         ASSERT_EQUAL(8, multiplier.bytes);
     }
+    // In Langevin dynamics too.
+    System system;
+    system.addParticle(20);
+    VariableStepRattleLangevinIntegrator integrator(300, 1, 0.002);
+    integrator.addConstraint("z1-height", {0}, {{"height", 0}});
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions({Vec3()});
+    double height = 0;
+    auto step = [&](int steps, double rate) {
+        for (int i = 0; i < steps; i++) {
+            height += rate;
+            if (rate != 0)
+                integrator.setExpressionParameterValue(0, "height", height);
+            integrator.step(1);
+        }
+    };
+    step(5, 0);
+    const Calls atRest = callsOf([&] { step(20, 0); });
+    step(1, 1e-4);
+    const Calls moving = callsOf([&] { step(20, 1e-4); });
+    ASSERT(integrator.isOnDevice());
+    ASSERT_EQUAL(0, integrator.getNumSubstepped());
+    ASSERT_EQUAL(atRest.downloads, moving.downloads);
+    ASSERT_EQUAL(atRest.waits + 20,
+                 moving.waits); // the upload waits for what it takes from the host, as all of OpenMM's
+    ASSERT_EQUAL(atRest.uploads + 20, moving.uploads);
+    ASSERT_EQUAL(atRest.bytes + 16 * 20, moving.bytes);
+    ASSERT_EQUAL(atRest.launches + 20, moving.launches);
+}
+
+// Automatic step control asks for no launch, no look and no byte more than the update Explicit.
+void testAutomaticControl() {
+    Dumbbells t(20);
+    Calls found[2];
+    for (const bool isAutomatic : {false, true}) {
+        Integrator_ integrator(0.001);
+        integrator.clearMonitors();
+        integrator.addMonitor(Integrator_::ConstraintAndAppliedForce);
+        integrator.setUpdateMethod(Integrator_::Explicit);
+        if (isAutomatic)
+            integrator.useAutomaticStepControl(10);
+        Context context(t.system, integrator, getTestPlatform());
+        t.begin(context);
+        integrator.step(20);
+        found[isAutomatic] = callsOf([&] { integrator.step(100); });
+        ASSERT(integrator.isOnDevice());
+    }
+    ASSERT_EQUAL(found[0].launches, found[1].launches);
+    ASSERT_EQUAL(found[0].waits, found[1].waits);
+    ASSERT_EQUAL(found[0].uploads, found[1].uploads);
+    ASSERT_EQUAL(found[0].downloads, found[1].downloads);
 }
 
 } // namespace
@@ -218,6 +267,7 @@ int main(int argc, char** argv) {
     return runOnPlatform({{"waits with thermostats", testThermostats},
                           {"waits of OpenMM's own", testOpenMM},
                           {"waits with a barostat", testBarostat},
-                          {"traffic of a constraint that moves", testTraffic}},
+                          {"traffic of a constraint that moves", testTraffic},
+                          {"automatic step control", testAutomaticControl}},
                          argc, argv);
 }

@@ -175,6 +175,8 @@ inline DEVICE void acceptAutomaticStep(const mixed* sums, wide* now, GLOBAL cons
         automaticMoveOnPart(&numbers, references, &choice, kT, min((wide) 1, now[STEP_SIZE]*automaticDensity(&choice, numbers.ahead)/choice.stepSize));
         now[DENSITY] = automaticDensity(&choice, numbers.behind);
     }
+    if (now[IS_JUMP] != 0)
+        automaticChange(&numbers, references, &choice, kT, numbers.values[0], 1);
     now[IS_ACCEPTED] = 1;
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)
         now[FIRST_NUMBER + i] = ((wide*) &numbers)[i];

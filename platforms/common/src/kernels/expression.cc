@@ -34,6 +34,12 @@ typedef struct {
         GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force, GLOBAL int* RESTRICT failure, GLOBAL const int* RESTRICT parts, GLOBAL const int* RESTRICT partTables, \
         GLOBAL mixed* partWork, GLOBAL const mixed* RESTRICT partShifts, GLOBAL mixed* partMultipliers, GLOBAL int* RESTRICT partIterations, \
         GLOBAL const mixed* parametersHere, GLOBAL const mixed* nextParameters, int numParameters, int areParametersMoving
+// In Langevin dynamics those in the middle of the step follow.
+#if UPDATE == LANGEVIN
+#define MIDDLE_PARAMETERS , GLOBAL const mixed* middleParameters
+#else
+#define MIDDLE_PARAMETERS
+#endif
 #define EXPRESSION_STATE_PARAMETERS int paddedNumAtoms, GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT posqCorrection, GLOBAL mixed4* RESTRICT velm, GLOBAL const mm_long* RESTRICT force
 #define EXPRESSION_STATE_ARGUMENTS paddedNumAtoms, posq, posqCorrection, velm, force
 #define OPEN_PART openPart(partTables + parts[i], partWork, partShifts, partMultipliers)
@@ -601,9 +607,13 @@ KERNEL void tryExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRIC
 
 /** advanceStep for the parts, which takes the step size that that has found. */
 KERNEL void advanceExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities,
-        EXPRESSION_PARAMETERS LARGE_NOISE_STATE) {
+        EXPRESSION_PARAMETERS MIDDLE_PARAMETERS LARGE_NOISE_STATE) {
     EXPRESSION_MEMORY
     OPEN_PARAMETERS
+    Parameters first = theta; // of the first drift
+#if UPDATE == LANGEVIN
+    first.next = middleParameters;
+#endif
     const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
     const mixed dt = (mixed) nextControl[STEP_SIZE], drift = (UPDATE == LANGEVIN ? dt/2 : dt), inverse = (drift > 0 ? 1/drift : (mixed) 0);
 #if UPDATE == LANGEVIN
@@ -621,9 +631,9 @@ KERNEL void advanceExpressions(int step, mixed tolerance, GLOBAL const wide* RES
                 oldVelocities[atom] = velm[atom];
             }
         findRows(&part, part.position, theta.here, part.G);
-        int iterations = solvePart(&part, dt/2*drift, tolerance, &theta, buffer);
+        int iterations = solvePart(&part, dt/2*drift, tolerance, &first, buffer);
 #if UPDATE == LANGEVIN
-        const bool isRegular = turnPart(&part, drift, &theta, noise, atomIndex);
+        const bool isRegular = turnPart(&part, drift, &first, noise, atomIndex);
         const int more = solvePart(&part, 0, tolerance, &theta, buffer);
         iterations = (iterations < 0 || more < 0 ? -1 : iterations + more);
         if (!isRegular)

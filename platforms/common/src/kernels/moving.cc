@@ -3,14 +3,15 @@
 
 // Parameters of expressions that move (docs/method.md, section 9): what comes before a step in which they do, or in which they stop.
 
-#define HAS_JUMPS (UPDATE == SUM || UPDATE == BOUNDED || UPDATE == SEMI_EXPLICIT)
+#define HAS_JUMPS (UPDATE == SUM || UPDATE == BOUNDED || UPDATE == SEMI_EXPLICIT || UPDATE == AUTOMATIC)
 
 /**
  * How far parameters move: what is left of a change by whole periods of g. Where a rate changes suddenly the velocities along the
- * constraints jump in the step that comes, and the monitors with them; the sums of these are left for judgeJump().
+ * constraints jump in the step that comes, and the monitors with them; the sums of these are left for judgeJump(): those of monitors, or
+ * with automatic step control what is needed of the kinetic energy. In Langevin dynamics half of the way is in the middle of the step.
  */
 KERNEL void moveExpressions(int step, int wereMoving, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials,
-        GLOBAL mixed* RESTRICT jumpPartials, GLOBAL mixed* RESTRICT jumpRates, GLOBAL int* RESTRICT hasJumped, GLOBAL mixed* changedParameters, EXPRESSION_PARAMETERS) {
+        GLOBAL mixed* RESTRICT jumpPartials, GLOBAL mixed* RESTRICT jumpRates, GLOBAL int* RESTRICT hasJumped, GLOBAL mixed* changedParameters, GLOBAL mixed* middleParameters, EXPRESSION_PARAMETERS) {
     EXPRESSION_MEMORY
     OPEN_PARAMETERS
     const bool isFrozen = IS_FROZEN(failure, step);
@@ -30,10 +31,16 @@ KERNEL void moveExpressions(int step, int wereMoving, GLOBAL const wide* RESTRIC
             if (theta.areMoving && end > first) {
                 const mixed change = findValue(kind, part.position, at, theta.next + first) - findValue(kind, part.position, at, theta.here + first);
                 const mixed linear = findMotion(kind, part.position, at, theta.here + first, theta.changes + first, 1);
-                if (linear != 0 && change/linear < (mixed) 0.5f) // which no curvature of g makes of a small change
+                const mixed linearThere = findMotion(kind, part.position, at, theta.next + first, theta.changes + first, 1);
+                // A period, after which g changes as before; the mere curvature of g would make it change the other way.
+                if (linear != 0 && change/linear < (mixed) 0.5f && linearThere/linear > (mixed) 0.5f)
                     KEEP_LOOP for (int p = first; p < end; p++)
                         changes[p] *= change/linear;
             }
+#if UPDATE == LANGEVIN
+            KEEP_LOOP for (int p = first; p < end; p++)
+                middleParameters[p] = theta.here[p] + changes[p]/2;
+#endif
 #if HAS_JUMPS
             KEEP_LOOP for (int p = first; p < end; p++) {
                 const mixed before = (wereMoving ? lastRate*lastChanges[p] : (mixed) 0), after = (theta.areMoving ? rate*changes[p] : (mixed) 0);
@@ -58,11 +65,25 @@ KERNEL void moveExpressions(int step, int wereMoving, GLOBAL const wide* RESTRIC
         pushParticles(&part, part.solution, -1, part.base, part.moved);
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = 0;
+#if UPDATE == AUTOMATIC
+        mixed energies[2] = {0, 0}; // twice those of the change and, without it, of what it adds
+        KEEP_LOOP for (int j = THREAD; j < part.numParticles; j += NUM_THREADS)
+            if (part.inverseMass[j] > 0)
+                UNROLL for (int d = 0; d < 3; d++) {
+                    const mixed before = part.base[3*j+d], after = part.moved[3*j+d];
+                    energies[0] += (after - before)*(after - before)/part.inverseMass[j];
+                    energies[1] += (after*after - before*before)/part.inverseMass[j];
+                }
+        ADD_IN_GROUP(energies, 2);
+        sums[SUM_CHANGE] = energies[0];
+        sums[SUM_KINETIC] = energies[1];
+#else
         Parameters jump = theta;
         jump.changes = jumpRates;
         jump.areMoving = 1;
         measurePart(&part, part.moved, &jump, theta.here, 1, force, paddedNumAtoms, sums);
-        MERGE_SUMS(sums);
+        MERGE_PART_SUMS(sums);
+#endif
         if (THREAD == 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 jumpPartials[j*numPartials + firstPartial + i] = sums[j];
@@ -74,25 +95,32 @@ KERNEL void moveExpressions(int step, int wereMoving, GLOBAL const wide* RESTRIC
     KEEP_LOOP for (int i = (GROUP_ID == 0 ? THREAD : numPartials); i < numPartials; i += NUM_THREADS)
         if (i < firstPartial || i >= firstPartial + numParts)
             for (int j = 0; j < NUM_SUMS; j++)
-                jumpPartials[j*numPartials + i] = partials[j*numPartials + i];
+                jumpPartials[j*numPartials + i] = (UPDATE == AUTOMATIC ? (mixed) 0 : partials[j*numPartials + i]);
 #endif
 }
 
 #if HAS_JUMPS
 
-/** By how much u, and the density with it, changes in such a jump; of one work group. */
+/** By how much u, and the density with it, changes in such a jump, or whether automatic step control counts it; of one work group. */
 KERNEL void judgeJump(int step, wide groupEnergy, int numPartials, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings, GLOBAL const mixed* RESTRICT partials,
         GLOBAL const mixed* RESTRICT jumpPartials, GLOBAL int* RESTRICT hasJumped, GLOBAL const int* RESTRICT failure) {
     LOCAL mixed buffer[NUM_SUMS*GROUP_SIZE];
     mixed sums[NUM_SUMS], jumpSums[NUM_SUMS];
+#if UPDATE != AUTOMATIC
     wide values[NUM_VALUES];
+#endif
     gatherSums(numPartials, partials, sums, buffer);
     SYNC_THREADS;
     gatherSums(numPartials, jumpPartials, jumpSums, buffer);
     if (LOCAL_ID == 0) {
+#if UPDATE == AUTOMATIC
+        const wide before = sums[SUM_KINETIC], after = before + (wide) jumpSums[SUM_KINETIC];
+        control[IS_JUMP_AHEAD] = (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && jumpSums[SUM_CHANGE] > (wide) SMALL_JUMP_OF_ENERGY*max(before, after) ? 1 : 0);
+#else
         const wide u = evaluateMonitors(sums, groupEnergy, settings, values), next = evaluateMonitors(jumpSums, groupEnergy, settings, values);
         if (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && u > 0 && next > 0 && next < (wide) 1e37f && fabs(next/u - 1) > (wide) SMALL_JUMP)
             control[DENSITY_SCALE] = next/u;
+#endif
         hasJumped[0] = 0;
     }
 }

@@ -206,6 +206,8 @@ inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL c
     now[IS_HALF_KNOWN] = 0;
 #if UPDATE == AUTOMATIC
     now[IS_ACCEPTED] = 0;
+    now[IS_JUMP] = now[IS_JUMP_AHEAD];
+    now[IS_JUMP_AHEAD] = 0;
 #endif
     now[STEPS] += 1;
     // The time in two numbers, so that a float loses none of it.
