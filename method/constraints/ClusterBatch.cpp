@@ -5,9 +5,11 @@
 #include "constraints/Pack.h"
 #include "constraints/Wide.h"
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <map>
+#include <tuple>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -69,15 +71,28 @@ public:
     static constexpr int B = Topology::numBonds;
     static constexpr int P = Topology::numParticles;
 
-    BatchOf(const vector<ClusterShape>& given, const vector<int>& shapeOf, const vector<int>& particleTable,
-            int firstConstraint) :
-            particles(particleTable), firstConstraint(firstConstraint), numClusters((int) shapeOf.size()) {
+    BatchOf(const ClusterLayout& layout, const ClusterKind& kind, int firstConstraint) :
+            particles(kind.particles), firstConstraint(firstConstraint), numClusters(kind.getNumClusters()) {
         // Few packs differ in most systems: then their shapes stay in the processor's cache.
-        std::map<vector<int>, int> placeOf;
+        vector<ClusterShape> given;
+        std::map<ClusterShape, int> numberOf;
+        vector<int> numbers;
+        for (int cluster = 0; cluster < numClusters; cluster++) {
+            ClusterShape shape;
+            for (int i = 0; i < P; i++)
+                shape.inverseMasses[i] = layout.inverseMasses[kind.getParticle(cluster, i)];
+            for (int k = 0; k < B; k++)
+                shape.lengths[k] = layout.distances[kind.getConstraint(cluster, k)].length;
+            const auto found = numberOf.emplace(shape, (int) given.size());
+            if (found.second)
+                given.push_back(shape);
+            numbers.push_back(found.first->second);
+        }
+        std::map<std::array<int, PACK_SIZE>, int> placeOf;
         for (int first = 0; first < numClusters; first += PACK_SIZE) {
-            vector<int> pack;
+            std::array<int, PACK_SIZE> pack;
             for (int lane = 0; lane < PACK_SIZE; lane++)
-                pack.push_back(shapeOf[std::min(first + lane, numClusters - 1)]);
+                pack[lane] = numbers[std::min(first + lane, numClusters - 1)];
             const auto found = placeOf.emplace(pack, (int) shapes.size());
             if (found.second) {
                 shapes.emplace_back();
@@ -134,6 +149,14 @@ private:
     OPENMMVRATTLE_WIDE double completeWide(const OnStepArrays& step, int first, int end) const {
         return complete(step, first, end);
     }
+    /** What clusters of one topology may differ in. */
+    struct ClusterShape {
+        std::array<double, P> inverseMasses;
+        std::array<double, B> lengths;
+        bool operator<(const ClusterShape& other) const {
+            return std::tie(inverseMasses, lengths) < std::tie(other.inverseMasses, other.lengths);
+        }
+    };
     /** Which clusters a pack holds. Where the last pack is not full its last cluster stands in all the lanes left. */
     struct Lanes {
         const int* particle[PACK_SIZE];
@@ -505,83 +528,23 @@ template <class Topology> double BatchOf<Topology>::complete(const OnStepArrays&
     return smallestPivot;
 }
 
-// The particle that all constraints of a star share; -1 if there is none. Of a single bond it is the first particle.
-int findCentre(const vector<DistanceConstraint>& cluster) {
-    for (int candidate : {cluster[0].particle1, cluster[0].particle2}) {
-        bool isShared = std::all_of(cluster.begin(), cluster.end(), [&](const DistanceConstraint& c) {
-            return c.particle1 == candidate || c.particle2 == candidate;
-        });
-        if (isShared)
-            return candidate;
-    }
-    return -1;
-}
-
-vector<int> findParticles(const vector<DistanceConstraint>& cluster) {
-    vector<int> particles;
-    for (const DistanceConstraint& c : cluster)
-        for (int i : {c.particle1, c.particle2})
-            if (std::find(particles.begin(), particles.end(), i) == particles.end())
-                particles.push_back(i);
-    return particles;
+/** The batch, where the topology is that of the kind: pairs of particles, the first one the earlier place. */
+template <class Topology>
+std::unique_ptr<ClusterBatch> createIf(const ClusterLayout& layout, const ClusterKind& kind, int firstConstraint) {
+    vector<vector<int>> pairs;
+    for (int k = 0; k < Topology::numBonds; k++)
+        pairs.push_back({Topology::first(k), Topology::second(k)});
+    if (kind.hasExpressions || kind.particlesOf != pairs)
+        return nullptr;
+    return std::unique_ptr<ClusterBatch>(new BatchOf<Topology>(layout, kind, firstConstraint));
 }
 
 } // namespace
 
-bool ClusterBatch::isSupported(const vector<DistanceConstraint>& cluster) {
-    if (cluster.size() > 4)
-        return false;
-    const size_t numParticles = findParticles(cluster).size();
-    const bool isStar = findCentre(cluster) >= 0 && numParticles == cluster.size() + 1;
-    return isStar || (cluster.size() == 3 && numParticles == 3);
-}
-
-void ClusterBatch::arrange(const vector<DistanceConstraint>& cluster, vector<int>& order, vector<int>& particles) {
-    order.clear();
-    particles = findParticles(cluster);
-    if (particles.size() == 3 && cluster.size() == 3) {
-        // The particle of the two equal bonds first (the oxygen of a water), so that equal molecules have one shape.
-        for (int centre = 0; centre < 3; centre++) {
-            vector<double> lengths;
-            for (const DistanceConstraint& c : cluster)
-                if (c.particle1 == particles[centre] || c.particle2 == particles[centre])
-                    lengths.push_back(c.length);
-            if (lengths[0] == lengths[1]) {
-                std::rotate(particles.begin(), particles.begin() + centre, particles.begin() + centre + 1);
-                break;
-            }
-        }
-        for (auto pair : {std::make_pair(0, 1), {0, 2}, {1, 2}})
-            for (int k = 0; k < 3; k++) {
-                const DistanceConstraint& c = cluster[k];
-                int i = particles[pair.first], j = particles[pair.second];
-                if ((c.particle1 == i && c.particle2 == j) || (c.particle1 == j && c.particle2 == i))
-                    order.push_back(k);
-            }
-        return;
-    }
-    const int centre = findCentre(cluster);
-    particles = {centre};
-    for (int k = 0; k < (int) cluster.size(); k++) {
-        order.push_back(k);
-        particles.push_back(cluster[k].particle1 == centre ? cluster[k].particle2 : cluster[k].particle1);
-    }
-}
-
-std::unique_ptr<ClusterBatch> ClusterBatch::create(int numBonds, bool isTriangle, const vector<ClusterShape>& shapes,
-                                                   const vector<int>& shapeOf, const vector<int>& particles,
+std::unique_ptr<ClusterBatch> ClusterBatch::create(const ClusterLayout& layout, const ClusterKind& kind,
                                                    int firstConstraint) {
-    typedef std::unique_ptr<ClusterBatch> Result;
-    if (isTriangle)
-        return Result(new BatchOf<Triangle>(shapes, shapeOf, particles, firstConstraint));
-    switch (numBonds) {
-    case 1:
-        return Result(new BatchOf<Star<1>>(shapes, shapeOf, particles, firstConstraint));
-    case 2:
-        return Result(new BatchOf<Star<2>>(shapes, shapeOf, particles, firstConstraint));
-    case 3:
-        return Result(new BatchOf<Star<3>>(shapes, shapeOf, particles, firstConstraint));
-    default:
-        return Result(new BatchOf<Star<4>>(shapes, shapeOf, particles, firstConstraint));
-    }
+    for (auto create : {createIf<Star<1>>, createIf<Star<2>>, createIf<Star<3>>, createIf<Star<4>>, createIf<Triangle>})
+        if (auto batch = create(layout, kind, firstConstraint))
+            return batch;
+    return nullptr;
 }

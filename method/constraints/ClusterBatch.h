@@ -4,11 +4,9 @@
 #ifndef OPENMMVRATTLE_CLUSTERBATCH_H_
 #define OPENMMVRATTLE_CLUSTERBATCH_H_
 
-#include "constraints/DistanceConstraint.h"
+#include "constraints/ClusterLayout.h"
 #include "openmm/Vec3.h"
 #include <memory>
-#include <tuple>
-#include <vector>
 
 namespace OpenMMVRattle {
 
@@ -41,15 +39,6 @@ struct OnStepArrays {
     double* rightSideHalf; // K times it
     OpenMM::Vec3* acceleration; // M^-1 (F - G^T Lambda), or null if it is not wanted
     double kick; // of (3.12), h/(2 rho)
-};
-
-/** What clusters of one topology may differ in. */
-struct ClusterShape {
-    std::vector<double> inverseMasses; // 1/mass of each particle
-    std::vector<double> lengths;       // of each constraint
-    bool operator<(const ClusterShape& other) const {
-        return std::tie(inverseMasses, lengths) < std::tie(other.inverseMasses, other.lengths);
-    }
 };
 
 /**
@@ -95,30 +84,13 @@ public:
      */
     virtual double finish(const OnStepArrays& step, int first, int end) const = 0;
 
-    /** Whether there are kernels for clusters of this topology. */
-    static bool isSupported(const std::vector<DistanceConstraint>& cluster);
     /**
-     * Put the constraints of a supported cluster, and the particles of each, into the order of its topology: a triangle as 01, 02,
-     * 12, a star as 01, 02, 03 with its centre first.
+     * The clusters of a kind as a batch, or null if there are no kernels for this topology: there are for stars of up to four bonds and
+     * for triangles.
      *
-     * @param cluster             the constraints
-     * @param[out] order          the constraint that comes k-th
-     * @param[out] particles      the particles of the cluster
-     */
-    static void arrange(const std::vector<DistanceConstraint>& cluster, std::vector<int>& order,
-                        std::vector<int>& particles);
-    /**
-     * Create a batch.
-     *
-     * @param numBonds           the number of constraints in a cluster
-     * @param isTriangle         whether the three particles of a cluster are all joined
-     * @param shapes             masses and lengths that occur
-     * @param shapeOf            the shape of each cluster
-     * @param particles          the particles, cluster after cluster
      * @param firstConstraint    the first constraint of the batch in the internal order; the others follow, cluster after cluster
      */
-    static std::unique_ptr<ClusterBatch> create(int numBonds, bool isTriangle, const std::vector<ClusterShape>& shapes,
-                                                const std::vector<int>& shapeOf, const std::vector<int>& particles,
+    static std::unique_ptr<ClusterBatch> create(const ClusterLayout& layout, const ClusterKind& kind,
                                                 int firstConstraint);
 };
 

@@ -5,13 +5,14 @@
 #define OPENMMVRATTLE_CLUSTERELIMINATION_H_
 
 #include "constraints/ClusterCut.h"
+#include "constraints/EliminationOrder.h"
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
  * How the constraints of a cluster are eliminated, worked out from its graph alone: first those of each piece, which may be done at the
- * same time, then the joints between them. It is plain data, for a processor and a GPU alike.
+ * same time, then the joints between them; and which entries the factor has. It is plain data, for a processor and a GPU alike.
  */
 struct ClusterElimination {
     struct Piece {
@@ -21,6 +22,8 @@ struct ClusterElimination {
         std::vector<int> particles;
         std::vector<int>
             borders; // the joints that share particles with the piece, by their places; in increasing order
+        FactorColumns columns;       // of these constraints; the rows of the borders are behind theirs
+        MatrixEntries borderEntries; // what is left between the rows of the borders, below the diagonal; sorted
     };
     /** What is to be small: all that is computed, or what has to be done one after the other. */
     enum Goal { LeastFill, FewLevels };
@@ -35,6 +38,7 @@ struct ClusterElimination {
     std::vector<int> joints; // in the order of elimination
     std::vector<int> jointLevels;
     int numJointLevels = 0;
+    FactorColumns jointColumns;
     bool hasWideColumns = false; // in the factor of a piece; see EliminationOrder::WIDE
 };
 

@@ -8,6 +8,7 @@
 #include <set>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <utility>
 
 using namespace OpenMMVRattle;
@@ -19,8 +20,9 @@ namespace {
 // pays where the work can be shared, or does not stay in the processor's caches anyway.
 const int MIN_CUT_SIZE = 20000;
 
-/** What is worked on: constraints of both kinds, distances first. */
+/** What there is of constraints of both kinds, distances first. */
 struct Given {
+    const vector<double>& inverseMasses; // 0 for a particle that does not move
     const vector<DistanceConstraint>& distances;
     const vector<ExpressionConstraint>& expressions;
     int getSize() const {
@@ -29,43 +31,54 @@ struct Given {
     bool isExpression(int k) const {
         return k >= (int) distances.size();
     }
-    const ExpressionConstraint& getExpression(int k) const {
-        return expressions[k - distances.size()];
-    }
+    vector<int> findMovingParticles(int k) const;
 };
 
-/** Finds clusters, and the order in each. */
+/** A cluster, its particles and constraints at the places that they have in all of its kind. */
+struct Arranged {
+    vector<int> particles, constraints;
+    vector<vector<int>> particlesOf;
+    bool hasExpressions;
+};
+
+/** Finds clusters, and the orders in each. */
 class LayoutBuilder {
 public:
-    LayoutBuilder(const vector<double>& inverseMasses, const Given& given) :
-            inverseMasses(inverseMasses), given(given) {
+    explicit LayoutBuilder(const Given& given) :
+            given(given), degrees(given.inverseMasses.size()), particlePlaces(degrees),
+            constraintPlaces(given.getSize()) {
     }
     vector<vector<int>> findClusters(const vector<int>& members) const;
+    Arranged arrange(const vector<int>& cluster);
+    /** After arrange(). */
     ClusterElimination cutAndOrder(const vector<int>& cluster) const;
 
 private:
-    vector<int> findMovingParticles(int k) const;
+    vector<int> findMovingParticles(int k) const {
+        return given.findMovingParticles(k);
+    }
+    void putApexFirst(vector<int>& triangle, const vector<int>& cluster) const;
     vector<int> orderAlongMolecule(const vector<int>& cluster, const vector<int>& members) const;
     vector<int> walk(const vector<int>& cluster) const;
     vector<int> walkThroughParticles(const vector<int>& cluster, const std::map<int, vector<int>>& constraintsOf) const;
     vector<int> walkThroughConstraints(const vector<int>& cluster,
                                        const std::map<int, vector<int>>& constraintsOf) const;
-    const vector<double>& inverseMasses; // 0 for a particle that does not move
     const Given& given;
+    vector<int> degrees, particlePlaces, constraintPlaces; // in their clusters
 };
 
-vector<int> LayoutBuilder::findMovingParticles(int k) const {
+vector<int> Given::findMovingParticles(int k) const {
     vector<int> result;
     auto addIfMoving = [&](int i) {
         if (inverseMasses[i] > 0)
             result.push_back(i);
     };
-    if (given.isExpression(k)) {
-        for (int i : given.getExpression(k).particles)
+    if (isExpression(k)) {
+        for (int i : expressions[k - distances.size()].particles)
             addIfMoving(i);
     }
-    else if (inverseMasses[given.distances[k].particle1] > 0)
-        result = {given.distances[k].particle1, given.distances[k].particle2};
+    else if (inverseMasses[distances[k].particle1] > 0)
+        result = {distances[k].particle1, distances[k].particle2};
     return result;
 }
 
@@ -108,6 +121,59 @@ vector<vector<int>> LayoutBuilder::findClusters(const vector<int>& members) cons
     return result;
 }
 
+Arranged LayoutBuilder::arrange(const vector<int>& cluster) {
+    Arranged result;
+    result.hasExpressions = given.isExpression(cluster.back());
+    for (int k : cluster) {
+        result.particlesOf.push_back(findMovingParticles(k));
+        for (int i : result.particlesOf.back())
+            if (degrees[i]++ == 0)
+                result.particles.push_back(i);
+    }
+    std::stable_sort(result.particles.begin(), result.particles.end(),
+                     [&](int a, int b) { return degrees[a] > degrees[b]; });
+    const bool isTriangle = cluster.size() == 3 && !result.hasExpressions && result.particles.size() == 3 &&
+                            degrees[result.particles.back()] == 2;
+    if (isTriangle)
+        putApexFirst(result.particles, cluster);
+    for (size_t place = 0; place < result.particles.size(); place++)
+        particlePlaces[result.particles[place]] = (int) place;
+    vector<std::pair<vector<int>, int>> sorted;
+    for (size_t k = 0; k < cluster.size(); k++) {
+        vector<int>& places = result.particlesOf[k];
+        for (int& i : places)
+            i = particlePlaces[i];
+        if (!given.isExpression(cluster[k]))
+            std::sort(places.begin(), places.end());
+        sorted.emplace_back(std::move(places), cluster[k]);
+    }
+    auto isDistance = [&](const auto& each) { return !given.isExpression(each.second); };
+    const auto firstExpression = std::find_if_not(sorted.begin(), sorted.end(), isDistance);
+    std::sort(sorted.begin(), firstExpression);
+    std::sort(firstExpression, sorted.end());
+    for (size_t place = 0; place < sorted.size(); place++) {
+        constraintPlaces[sorted[place].second] = (int) place;
+        result.constraints.push_back(sorted[place].second);
+        result.particlesOf[place] = std::move(sorted[place].first);
+    }
+    return result;
+}
+
+// The oxygen of a water, for example, so that equal molecules have equal lengths in the same order.
+void LayoutBuilder::putApexFirst(vector<int>& triangle, const vector<int>& cluster) const {
+    for (int candidate = 0; candidate < 3; candidate++) {
+        vector<double> lengths;
+        for (int k : cluster)
+            if (given.distances[k].particle1 == triangle[candidate] ||
+                given.distances[k].particle2 == triangle[candidate])
+                lengths.push_back(given.distances[k].length);
+        if (lengths[0] == lengths[1]) {
+            std::rotate(triangle.begin(), triangle.begin() + candidate, triangle.begin() + candidate + 1);
+            return;
+        }
+    }
+}
+
 // Cut a cluster that is large, and put its constraints in the order in which they are eliminated.
 ClusterElimination LayoutBuilder::cutAndOrder(const vector<int>& cluster) const {
     vector<vector<int>> particlesOf;
@@ -121,13 +187,17 @@ ClusterElimination LayoutBuilder::cutAndOrder(const vector<int>& cluster) const 
     for (ClusterCut::Piece& piece : cut.pieces)
         piece.constraints = orderAlongMolecule(cluster, piece.constraints);
     ClusterElimination result(particlesOf, cut, ClusterElimination::LeastFill);
-    auto toGiven = [&](vector<int>& members) {
+    // From places among the given constraints, and the particles' numbers, to the places that all of the kind have.
+    auto placeConstraints = [&](vector<int>& members) {
         for (int& k : members)
-            k = cluster[k];
+            k = constraintPlaces[cluster[k]];
     };
-    for (ClusterElimination::Piece& piece : result.pieces)
-        toGiven(piece.constraints);
-    toGiven(result.joints);
+    for (ClusterElimination::Piece& piece : result.pieces) {
+        placeConstraints(piece.constraints);
+        for (int& i : piece.particles)
+            i = particlePlaces[i];
+    }
+    placeConstraints(result.joints);
     return result;
 }
 
@@ -240,71 +310,51 @@ vector<int> LayoutBuilder::walkThroughConstraints(const vector<int>& cluster,
 
 } // namespace
 
-ClusterLayout::ClusterLayout(const vector<double>& inverseMasses, const vector<DistanceConstraint>& distances,
-                             const vector<ExpressionConstraint>& expressions) {
+ClusterLayout::ClusterLayout(const vector<double>& masses, const vector<DistanceConstraint>& givenDistances,
+                             const vector<ExpressionConstraint>& expressions) : distances(givenDistances) {
+    for (double mass : masses)
+        inverseMasses.push_back(mass > 0 ? 1.0 / mass : 0.0);
     for (const DistanceConstraint& c : distances)
         if ((inverseMasses[c.particle1] == 0) != (inverseMasses[c.particle2] == 0))
             throw std::invalid_argument("a distance constraint involves a particle whose mass is zero, " +
                                         std::to_string(inverseMasses[c.particle1] == 0 ? c.particle1 : c.particle2));
-    const Given given = {distances, expressions};
-    const LayoutBuilder builder(inverseMasses, given);
-    // Small clusters with the same topology make a batch; the others are general.
-    struct Member {
-        vector<int> constraints, particles;
-        ClusterShape shape;
-    };
-    std::map<std::pair<int, int>, vector<Member>> topologies; // by the numbers of constraints and of particles
+    const Given given = {inverseMasses, distances, expressions};
+    LayoutBuilder builder(given);
     vector<int> all(given.getSize());
     std::iota(all.begin(), all.end(), 0);
-    for (vector<int>& cluster : builder.findClusters(all)) {
-        vector<DistanceConstraint> members;
-        bool mayBeInBatch = true;
-        for (int k : cluster) {
-            mayBeInBatch = mayBeInBatch && !given.isExpression(k);
-            if (mayBeInBatch)
-                members.push_back(distances[k]);
-        }
-        if (!mayBeInBatch || !ClusterBatch::isSupported(members)) {
-            general.push_back(builder.cutAndOrder(cluster));
-            continue;
-        }
-        vector<int> order;
-        Member member;
-        ClusterBatch::arrange(members, order, member.particles);
-        for (int k : order) {
-            member.constraints.push_back(cluster[k]);
-            member.shape.lengths.push_back(members[k].length);
-        }
-        for (int i : member.particles)
-            member.shape.inverseMasses.push_back(inverseMasses[i]);
-        topologies[{(int) order.size(), (int) member.particles.size()}].push_back(std::move(member));
+    const vector<vector<int>> found = builder.findClusters(all);
+
+    typedef std::tuple<size_t, size_t, bool, vector<vector<int>>> Key;
+    std::map<Key, vector<std::pair<size_t, Arranged>>> members; // with their numbers among those that were found
+    vector<char> isFree(masses.size(), true);
+    for (size_t c = 0; c < found.size(); c++) {
+        Arranged arranged = builder.arrange(found[c]);
+        for (int i : arranged.particles)
+            isFree[i] = false;
+        Key key(arranged.constraints.size(), arranged.particles.size(), arranged.hasExpressions,
+                std::move(arranged.particlesOf));
+        members[std::move(key)].emplace_back(c, std::move(arranged));
     }
-    for (auto& entry : topologies) {
-        vector<Member>& members = entry.second;
-        std::sort(members.begin(), members.end(),
-                  [](const Member& a, const Member& b) { return a.particles[0] < b.particles[0]; });
-        Batch batch;
-        batch.numBonds = entry.first.first;
-        batch.isTriangle = batch.numBonds == 3 && entry.first.second == 3;
-        std::map<ClusterShape, int> numberOf;
-        for (const Member& member : members) {
-            batch.constraints.insert(batch.constraints.end(), member.constraints.begin(), member.constraints.end());
-            batch.particles.insert(batch.particles.end(), member.particles.begin(), member.particles.end());
-            const auto number = numberOf.emplace(member.shape, (int) batch.shapes.size());
-            if (number.second)
-                batch.shapes.push_back(member.shape);
-            batch.shapeOf.push_back(number.first->second);
+    kinds.emplace_back();
+    kinds[0].numParticles = 1;
+    for (size_t i = 0; i < masses.size(); i++)
+        if (isFree[i] && inverseMasses[i] > 0)
+            kinds[0].particles.push_back((int) i);
+    clusters.resize(found.size());
+    for (auto& [key, list] : members) {
+        ClusterKind kind;
+        kind.numParticles = (int) std::get<1>(key);
+        kind.hasExpressions = std::get<2>(key);
+        kind.particlesOf = std::get<3>(key);
+        std::sort(list.begin(), list.end(),
+                  [](const auto& a, const auto& b) { return a.second.particles[0] < b.second.particles[0]; });
+        for (size_t number = 0; number < list.size(); number++) {
+            const auto& [c, member] = list[number];
+            kind.particles.insert(kind.particles.end(), member.particles.begin(), member.particles.end());
+            kind.constraints.insert(kind.constraints.end(), member.constraints.begin(), member.constraints.end());
+            clusters[c] = {(int) kinds.size(), (int) number};
         }
-        batches.push_back(std::move(batch));
+        kind.elimination = builder.cutAndOrder(found[list[0].first]);
+        kinds.push_back(std::move(kind));
     }
-    auto isDistance = [&](int k) { return !given.isExpression(k); };
-    auto hasNoExpression = [&](const ClusterElimination& cluster) {
-        return std::all_of(cluster.joints.begin(), cluster.joints.end(), isDistance) &&
-               std::all_of(cluster.pieces.begin(), cluster.pieces.end(), [&](const ClusterElimination::Piece& piece) {
-                   return std::all_of(piece.constraints.begin(), piece.constraints.end(), isDistance);
-               });
-    };
-    std::stable_partition(general.begin(), general.end(), hasNoExpression);
-    std::stable_partition(general.begin(), general.end(),
-                          [](const ClusterElimination& cluster) { return cluster.pieces.size() == 1; });
 }

@@ -8,6 +8,7 @@
 #include "constraints/ConstraintSystem.h"
 #include <algorithm>
 #include <map>
+#include <numeric>
 #include <tuple>
 
 using namespace OpenMMVRattle;
@@ -21,52 +22,50 @@ const int BLOCK_SIZE = 1024;
 // The number of constraints that a part of the general clusters is filled up to.
 const int PART_SIZE = ClusterLayout::PIECE_SIZE;
 
-vector<double> invert(const vector<double>& masses) {
-    vector<double> result;
-    for (double mass : masses)
-        result.push_back(mass > 0 ? 1.0 / mass : 0.0);
-    return result;
-}
-
 } // namespace
 
 ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<DistanceConstraint>& distances,
                                    const vector<ExpressionConstraint>& expressions) :
         numGivenConstraints((int) (distances.size() + expressions.size())), numGivenDistances((int) distances.size()),
-        masses(masses), inverseMasses(invert(masses)), layout(inverseMasses, distances, expressions),
-        expressions(expressions) {
-    auto append = [&](const vector<int>& members) {
-        for (int k : members) {
+        masses(masses), layout(masses, distances, expressions), inverseMasses(layout.inverseMasses),
+        expressions(expressions), freeParticles(layout.kinds[0].particles) {
+    auto append = [&](int kind, int number, const vector<int>& places) {
+        for (int place : places) {
+            const int k = layout.kinds[kind].getConstraint(number, place);
             constraints.push_back(k >= numGivenDistances ? DistanceConstraint{-1, -1, 1.0} : distances[k]);
             givenIndex.push_back(k);
         }
     };
-    vector<char> isInBatch(masses.size(), false);
-    for (const ClusterLayout::Batch& batch : layout.batches) {
-        const int first = (int) constraints.size();
-        append(batch.constraints);
-        for (int k = first; k < getNumConstraints(); k += batch.numBonds)
-            clusters.push_back({k, batch.numBonds});
-        for (int i : batch.particles)
-            isInBatch[i] = true;
-        batches.push_back(ClusterBatch::create(batch.numBonds, batch.isTriangle, batch.shapes, batch.shapeOf,
-                                               batch.particles, first));
+    vector<char> isInBatch(layout.kinds.size(), false);
+    for (size_t kind = 1; kind < layout.kinds.size(); kind++) {
+        auto batch = ClusterBatch::create(layout, layout.kinds[kind], getNumConstraints());
+        if (batch == nullptr)
+            continue;
+        isInBatch[kind] = true;
+        batches.push_back(std::move(batch));
+        vector<int> places(layout.kinds[kind].getNumConstraints());
+        std::iota(places.begin(), places.end(), 0);
+        for (int number = 0; number < layout.kinds[kind].getNumClusters(); number++) {
+            clusters.push_back({getNumConstraints(), (int) places.size(), (int) kind});
+            append((int) kind, number, places);
+        }
     }
-    firstGeneral = (int) constraints.size();
-    for (const ClusterElimination& cluster : layout.general) {
+    firstGeneral = getNumConstraints();
+    const vector<ClusterLayout::Cluster> general = findGeneral(isInBatch);
+    for (const ClusterLayout::Cluster& each : general) {
         const int first = getNumConstraints();
-        for (const ClusterElimination::Piece& piece : cluster.pieces)
-            append(piece.constraints);
-        append(cluster.joints);
-        clusters.push_back({first, getNumConstraints() - first});
+        const ClusterElimination& elimination = layout.kinds[each.kind].elimination;
+        for (const ClusterElimination::Piece& piece : elimination.pieces)
+            append(each.kind, each.number, piece.constraints);
+        append(each.kind, each.number, elimination.joints);
+        clusters.push_back({first, getNumConstraints() - first, each.kind});
     }
     groupExpressions();
     findStretches();
-    findParts();
+    findParts(general);
     findGroupRanges();
     findJointEnds();
     findCouplings();
-    findFreeParticles(isInBatch);
     findBlocks();
     for (int k = 0; k < getNumConstraints(); k++) {
         const double length = constraints[k].length;
@@ -76,6 +75,19 @@ ConstraintSystem::ConstraintSystem(const vector<double>& masses, const vector<Di
 }
 
 ConstraintSystem::~ConstraintSystem() {
+}
+
+// The clusters that are in no batch: those that are cut last, and of each sort the ones with an expression after the others.
+vector<ClusterLayout::Cluster> ConstraintSystem::findGeneral(const vector<char>& isInBatch) const {
+    vector<ClusterLayout::Cluster> general;
+    auto kindOf = [&](const ClusterLayout::Cluster& each) -> const ClusterKind& { return layout.kinds[each.kind]; };
+    std::copy_if(layout.clusters.begin(), layout.clusters.end(), std::back_inserter(general),
+                 [&](const ClusterLayout::Cluster& each) { return !isInBatch[each.kind]; });
+    auto rank = [&](const ClusterLayout::Cluster& each) {
+        return std::make_pair(kindOf(each).elimination.pieces.size() > 1, kindOf(each).hasExpressions);
+    };
+    std::stable_sort(general.begin(), general.end(), [&](const auto& a, const auto& b) { return rank(a) < rank(b); });
+    return general;
 }
 
 // Give every expression its entries of a Jacobian and put it into the group of its like.
@@ -123,7 +135,7 @@ void ConstraintSystem::findStretches() {
 }
 
 // The general clusters in parts, with their particles.
-void ConstraintSystem::findParts() {
+void ConstraintSystem::findParts(const vector<ClusterLayout::Cluster>& general) {
     Part open = {0, firstGeneral, 0, 0, 0, 0, 0, 0, 0, 0, NONE, 0};
     auto beginNext = [&]() {
         open.index++;
@@ -131,11 +143,12 @@ void ConstraintSystem::findParts() {
         open.firstRow = open.endRow;
         open.firstParticle = open.endParticle;
     };
-    auto extend = [&](const vector<int>& members, const vector<int>& particles) {
+    auto extend = [&](const vector<int>& members, const vector<int>& places, const ClusterLayout::Cluster& cluster) {
         open.end += (int) members.size();
         while (open.endRow < (int) expressionRows.size() && expressionRows[open.endRow].constraint < open.end)
             open.endRow++;
-        generalParticles.insert(generalParticles.end(), particles.begin(), particles.end());
+        for (int place : places)
+            generalParticles.push_back(layout.kinds[cluster.kind].getParticle(cluster.number, place));
         open.endParticle = (int) generalParticles.size();
     };
     auto closePart = [&]() {
@@ -145,26 +158,27 @@ void ConstraintSystem::findParts() {
         beginNext();
     };
     closePart(); // the batches
-    for (const ClusterElimination& cluster : layout.general) {
-        if (cluster.pieces.size() == 1) {
-            if (cluster.hasWideColumns)
+    for (const ClusterLayout::Cluster& cluster : general) {
+        const ClusterElimination& elimination = layout.kinds[cluster.kind].elimination;
+        if (elimination.pieces.size() == 1) {
+            if (elimination.hasWideColumns)
                 closePart();
-            extend(cluster.pieces[0].constraints, cluster.pieces[0].particles);
-            if (cluster.hasWideColumns || open.end - open.first >= PART_SIZE)
+            extend(elimination.pieces[0].constraints, elimination.pieces[0].particles, cluster);
+            if (elimination.hasWideColumns || open.end - open.first >= PART_SIZE)
                 closePart();
             continue;
         }
         closePart();
         CutCluster cut;
         cut.firstPiece = (int) pieces.size();
-        for (const ClusterElimination::Piece& piece : cluster.pieces) {
-            extend(piece.constraints, piece.particles);
+        for (const ClusterElimination::Piece& piece : elimination.pieces) {
+            extend(piece.constraints, piece.particles, cluster);
             pieces.push_back(open);
             pieces.back().piece = (int) pieces.size() - 1;
             beginNext();
         }
         cut.endPiece = (int) pieces.size();
-        extend(cluster.joints, {});
+        extend(elimination.joints, {}, cluster);
         cut.joints = open;
         cutClusters.push_back(cut);
         beginNext();
@@ -223,15 +237,6 @@ void ConstraintSystem::findJointEnds() {
         jointEnds.insert(jointEnds.end(), endsOf[piece.piece].begin(), endsOf[piece.piece].end());
         piece.endJointEnd = (int) jointEnds.size();
     }
-}
-
-void ConstraintSystem::findFreeParticles(const vector<char>& isInBatch) {
-    vector<char> isGeneral(masses.size(), false);
-    for (int i : generalParticles)
-        isGeneral[i] = true;
-    for (int i = 0; i < getNumParticles(); i++)
-        if (inverseMasses[i] > 0 && !isInBatch[i] && !isGeneral[i])
-            freeParticles.push_back(i);
 }
 
 void ConstraintSystem::findBlocks() {

@@ -23,62 +23,60 @@ ConstraintMatrix::ConstraintMatrix(const ConstraintSystem& system, const std::sh
         system(system), analysis(analysis), factors(analysis->begin(), analysis->end()) {
 }
 
+// Which entries there are is known cluster by cluster (ClusterElimination); here is where they are kept.
 ConstraintMatrix::Analysis ConstraintMatrix::analyse(const ConstraintSystem& system) {
     Analysis result;
     const vector<ConstraintSystem::Coupling>& couplings = system.getCouplings();
     auto rowOf = [&](size_t i) { return system.getConstraintOf(couplings[i].row); };
     auto columnOf = [&](size_t i) { return system.getConstraintOf(couplings[i].column); };
     size_t next = 0;
-    // Couplings are in the order of the parts, and in a piece's are those with its joints. More entries are those by other ways.
-    auto add = [&](const Part& part, MatrixEntries entries) {
+    // Couplings are in the order of the parts, and in a piece's are those with its joints.
+    auto add = [&](const Part& part, const FactorColumns& columns, vector<int> outer) -> PartAnalysis& {
         PartAnalysis each;
         const int size = part.end - part.first;
         each.first = part.first;
+        each.outer = std::move(outer);
+        each.pattern = FactorPattern(columns, (int) each.outer.size());
         each.firstCoupling = next;
-        while (next < couplings.size() && columnOf(next) < part.end) {
-            if (rowOf(next) >= part.end)
-                each.outer.push_back(rowOf(next));
-            next++;
+        for (; next < couplings.size() && columnOf(next) < part.end; next++) {
+            const int k = rowOf(next);
+            const auto place = std::lower_bound(each.outer.begin(), each.outer.end(), k);
+            const int row = k < part.end ? k - part.first : size + (int) (place - each.outer.begin());
+            each.couplingSlots.push_back(each.pattern.findSlot(row, columnOf(next) - part.first));
         }
         each.endCoupling = next;
-        std::sort(each.outer.begin(), each.outer.end());
-        each.outer.erase(std::unique(each.outer.begin(), each.outer.end()), each.outer.end());
-        auto localRow = [&](int k) {
-            if (k < part.end)
-                return k - part.first;
-            return size + (int) (std::lower_bound(each.outer.begin(), each.outer.end(), k) - each.outer.begin());
-        };
-        for (size_t i = each.firstCoupling; i < each.endCoupling; i++)
-            if (rowOf(i) != columnOf(i))
-                entries.emplace_back(localRow(rowOf(i)), columnOf(i) - part.first);
-        std::sort(entries.begin(), entries.end());
-        entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
-        each.pattern = FactorPattern(size, (int) each.outer.size(), entries);
-        for (size_t i = each.firstCoupling; i < each.endCoupling; i++)
-            each.couplingSlots.push_back(each.pattern.findSlot(localRow(rowOf(i)), columnOf(i) - part.first));
         result.push_back(std::move(each));
+        return result.back();
     };
-    for (const Part& part : system.getWholeParts())
-        add(part, {});
-    for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters()) {
-        const int firstJoint = cluster.joints.first;
-        MatrixEntries left; // for the joints by the pieces
+    auto cluster = system.getClusters().begin();
+    for (const Part& part : system.getWholeParts()) {
+        FactorColumns columns;
+        for (; cluster != system.getClusters().end() && cluster->first < part.end; ++cluster)
+            columns.append(system.getEliminationOf(*cluster).pieces[0].columns);
+        add(part, columns, {});
+    }
+    for (const ConstraintSystem::CutCluster& cut : system.getCutClusters()) {
+        const ClusterElimination& elimination = system.getEliminationOf(*cluster++);
         const size_t firstPiece = result.size();
-        for (int p = cluster.firstPiece; p < cluster.endPiece; p++) {
-            add(system.getPieces()[p], {});
-            const vector<int>& outer = result.back().outer;
-            for (size_t b = 0; b < outer.size(); b++)
-                for (size_t a = b + 1; a < outer.size(); a++)
-                    left.emplace_back(outer[a] - firstJoint, outer[b] - firstJoint);
+        for (size_t p = 0; p < elimination.pieces.size(); p++) {
+            vector<int> outer = elimination.pieces[p].borders;
+            for (int& joint : outer)
+                joint += cut.joints.first;
+            add(system.getPieces()[cut.firstPiece + p], elimination.pieces[p].columns, std::move(outer));
         }
-        const size_t joints = result.size();
-        add(cluster.joints, left);
-        for (size_t piece = firstPiece; piece < joints; piece++) {
-            const vector<int>& outer = result[piece].outer;
-            for (size_t b = 0; b < outer.size(); b++)
-                for (size_t a = b; a < outer.size(); a++)
-                    result[piece].outerSlots.push_back(
-                        result[joints].pattern.findSlot(outer[a] - firstJoint, outer[b] - firstJoint));
+        const FactorPattern joints = add(cut.joints, elimination.jointColumns, {}).pattern;
+        for (size_t p = 0; p < elimination.pieces.size(); p++) {
+            const ClusterElimination::Piece& piece = elimination.pieces[p];
+            PartAnalysis& each = result[firstPiece + p];
+            const int size = (int) piece.constraints.size();
+            auto leave = [&](int row, int column) {
+                each.left.push_back({each.pattern.findSlot(row, column),
+                                     joints.findSlot(piece.borders[row - size], piece.borders[column - size])});
+            };
+            for (int b = 0; b < (int) piece.borders.size(); b++)
+                leave(size + b, size + b);
+            for (const auto& entry : piece.borderEntries)
+                leave(entry.first, entry.second);
         }
     }
     return result;
@@ -112,12 +110,8 @@ int ConstraintMatrix::tryToFactorizeJoints(const ConstraintSystem::Jacobian& jac
     SparseFactor& joints = factors[cluster.joints.index].factor;
     for (int p = cluster.firstPiece; p < cluster.endPiece; p++) {
         const int index = system.getPieces()[p].index;
-        const PartAnalysis& piece = (*analysis)[index];
-        const unsigned* slot = piece.outerSlots.data();
-        const size_t size = piece.outer.size();
-        for (size_t b = 0; b < size; b++)
-            for (size_t a = b; a < size; a++)
-                joints.add(*slot++, factors[index].factor.getValue(piece.pattern.getFirstOuterValue() + b * size + a));
+        for (const Left& each : (*analysis)[index].left)
+            joints.add(each.to, factors[index].factor.getValue(each.from));
     }
     return factorizeAssembled(cluster.joints);
 }

@@ -25,15 +25,18 @@ namespace OpenMMVRattle {
  */
 class ConstraintMatrix {
 public:
-    /** How the matrix of a part is factorised. The outer rows of a piece are the joints that it has constraints in common with. */
+    /** An entry that a piece leaves for its joints: where its own matrix has it, and where that of the joints. */
+    struct Left {
+        unsigned from, to;
+    };
+    /** How the matrix of a part is factorised. The outer rows of a piece are the joints that share particles with it. */
     struct PartAnalysis {
         int first;                              // constraint of the part
         FactorPattern pattern;
         size_t firstCoupling, endCoupling;      // of ConstraintSystem::getCouplings()
         std::vector<unsigned> couplingSlots;    // where these go
         std::vector<int> outer;                 // the joints of a piece, in increasing order
-        std::vector<unsigned>
-            outerSlots; // where the joints' matrix has the entries for these, below the diagonal, column by column
+        std::vector<Left> left;
     };
     /** Of all parts, by their index. */
     typedef std::vector<PartAnalysis> Analysis;

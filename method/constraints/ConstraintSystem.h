@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 #define OPENMMVRATTLE_CONSTRAINTSYSTEM_H_
 
+#include "constraints/ClusterBatch.h"
 #include "constraints/ClusterLayout.h"
 #include "constraints/DistanceConstraint.h"
 #include "expressions/ExpressionGroup.h"
@@ -69,9 +70,9 @@ public:
         int firstPiece, endPiece; // of getPieces()
         Part joints;
     };
-    /** A cluster: the constraints first, ..., first + size - 1 of the internal order. */
+    /** A cluster: the constraints first, ..., first + size - 1 of the internal order; and its kind in the layout. */
     struct Cluster {
-        int first, size;
+        int first, size, kind;
     };
     /**
      * Where a block of neighbouring particles begins in the lists that are worked through block by block, so that what
@@ -183,6 +184,9 @@ public:
     }
     const std::vector<Cluster>& getClusters() const {
         return clusters;
+    }
+    const ClusterElimination& getEliminationOf(const Cluster& cluster) const {
+        return layout.kinds[cluster.kind].elimination;
     }
     const std::vector<Coupling>& getCouplings() const {
         return couplings;
@@ -323,10 +327,10 @@ private:
     void groupExpressions();
     void findStretches();
     void findCouplings();
-    void findParts();
+    std::vector<ClusterLayout::Cluster> findGeneral(const std::vector<char>& isInBatch) const;
+    void findParts(const std::vector<ClusterLayout::Cluster>& general);
     void findGroupRanges();
     void findJointEnds();
-    void findFreeParticles(const std::vector<char>& isInBatch);
     void findBlocks();
     template <class Task> void forDistances(const Part& part, const Task& task) const;
     template <class Task> void forRows(const Part& part, const Task& task) const;
@@ -335,8 +339,9 @@ private:
     const ExpressionRow& findRow(int constraint) const;
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     int numGivenConstraints, numGivenDistances, firstGeneral;
-    std::vector<double> masses, inverseMasses;
+    std::vector<double> masses;
     ClusterLayout layout;
+    const std::vector<double>& inverseMasses;
     std::vector<DistanceConstraint> constraints; // in the place of an expression there is nothing of meaning
     std::vector<int> givenIndex;                 // internal order -> order of the constructor
     std::vector<double> inverseSquareLengths, multiplierFactors;
@@ -356,7 +361,8 @@ private:
     std::vector<Part> wholeParts, generalParts, pieces;
     std::vector<CutCluster> cutClusters;
     std::vector<JointEnd> jointEnds;
-    std::vector<int> generalParticles, freeParticles;
+    std::vector<int> generalParticles;
+    const std::vector<int>& freeParticles;
 };
 
 } // namespace OpenMMVRattle

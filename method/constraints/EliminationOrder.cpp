@@ -78,38 +78,88 @@ vector<int> orderWide(const EliminationTree& tree, const vector<char>& isWide) {
 
 } // namespace
 
-// The tree by the algorithm of Liu (ACM Trans. Math. Softw. 12, 1986); the counts by a walk along the entries of each row of L.
-EliminationTree findEliminationTree(int size, const MatrixEntries& entries, size_t maxEntries) {
-    vector<size_t> start(size + 1, 0);
-    for (const auto& entry : entries)
-        start[entry.first + 1]++;
-    std::partial_sum(start.begin(), start.end(), start.begin());
-    vector<int> columns(entries.size());
-    vector<size_t> next(start.begin(), start.end() - 1);
-    for (const auto& entry : entries)
-        columns[next[entry.first]++] = entry.second;
+namespace {
 
-    const int NONE = EliminationTree::NONE;
-    EliminationTree tree = {vector<int>(size, NONE), vector<int>(size, 0), 0};
-    vector<int> ancestor(size, NONE), visited(size, NONE);
+/** The entries of a matrix row by row. */
+struct MatrixRows {
+    MatrixRows(int size, const MatrixEntries& entries) : start(size + 1, 0), columns(entries.size()) {
+        for (const auto& entry : entries)
+            start[entry.first + 1]++;
+        std::partial_sum(start.begin(), start.end(), start.begin());
+        vector<size_t> next(start.begin(), start.end() - 1);
+        for (const auto& entry : entries)
+            columns[next[entry.first]++] = entry.second;
+    }
+    vector<size_t> start;
+    vector<int> columns;
+};
+
+// By the algorithm of Liu (ACM Trans. Math. Softw. 12, 1986).
+vector<int> findParents(const MatrixRows& rows) {
+    const int NONE = EliminationTree::NONE, size = (int) rows.start.size() - 1;
+    vector<int> parent(size, NONE), ancestor(size, NONE);
     for (int row = 0; row < size; row++)
-        for (size_t k = start[row]; k < start[row + 1]; k++) {
-            int column = columns[k];
+        for (size_t k = rows.start[row]; k < rows.start[row + 1]; k++) {
+            int column = rows.columns[k];
             while (ancestor[column] != NONE && ancestor[column] != row)
                 column = std::exchange(ancestor[column], row);
             if (ancestor[column] == NONE)
-                ancestor[column] = tree.parent[column] = row;
+                ancestor[column] = parent[column] = row;
         }
-    for (int row = 0; row < size && tree.numEntries <= maxEntries; row++) {
+    return parent;
+}
+
+// Walk along the entries of L in the first columns, row by row: task(row, column), until it returns false at the end of a row.
+template <class Task, class RowTask>
+void walkThroughFactor(const MatrixRows& rows, const vector<int>& parent, int numColumns, const Task& task,
+                       const RowTask& goesOn) {
+    const int size = (int) parent.size();
+    vector<int> visited(size, EliminationTree::NONE);
+    for (int row = 0; row < size && goesOn(); row++) {
         visited[row] = row;
-        for (size_t k = start[row]; k < start[row + 1]; k++)
-            for (int column = columns[k]; visited[column] != row; column = tree.parent[column]) {
+        for (size_t k = rows.start[row]; k < rows.start[row + 1]; k++)
+            for (int column = rows.columns[k]; column < numColumns && visited[column] != row; column = parent[column]) {
                 visited[column] = row;
-                tree.counts[column]++;
-                tree.numEntries++;
+                task(row, column);
             }
     }
+}
+
+} // namespace
+
+EliminationTree findEliminationTree(int size, const MatrixEntries& entries, size_t maxEntries) {
+    const MatrixRows rows(size, entries);
+    EliminationTree tree = {findParents(rows), vector<int>(size, 0), 0};
+    auto count = [&](int, int column) {
+        tree.counts[column]++;
+        tree.numEntries++;
+    };
+    walkThroughFactor(rows, tree.parent, size, count, [&] { return tree.numEntries <= maxEntries; });
     return tree;
+}
+
+FactorColumns findFactorColumns(int numColumns, int numOuter, const MatrixEntries& entries) {
+    const MatrixRows rows(numColumns + numOuter, entries);
+    const vector<int> parent = findParents(rows);
+    auto always = [] { return true; };
+    FactorColumns result;
+    result.start.assign(numColumns + 1, 0);
+    walkThroughFactor(rows, parent, numColumns, [&](int, int column) { result.start[column + 1]++; }, always);
+    std::partial_sum(result.start.begin(), result.start.end(), result.start.begin());
+    result.rows.resize(result.start.back());
+    vector<size_t> next(result.start.begin(), result.start.end() - 1);
+    walkThroughFactor(
+        rows, parent, numColumns, [&](int row, int column) { result.rows[next[column]++] = row; }, always);
+    return result;
+}
+
+void FactorColumns::append(const FactorColumns& other) {
+    const int first = getNumColumns();
+    const size_t firstEntry = rows.size();
+    for (int row : other.rows)
+        rows.push_back(first + row);
+    for (size_t k = 1; k < other.start.size(); k++)
+        start.push_back(firstEntry + other.start[k]);
 }
 
 namespace {

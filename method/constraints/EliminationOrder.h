@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_ELIMINATIONORDER_H_
 #define OPENMMVRATTLE_ELIMINATIONORDER_H_
 
+#include <algorithm>
 #include <cstddef>
 #include <limits>
 #include <utility>
@@ -31,6 +32,43 @@ struct EliminationTree {
  */
 EliminationTree findEliminationTree(int size, const MatrixEntries& entries,
                                     size_t maxEntries = std::numeric_limits<size_t>::max());
+
+/** The entries of L below the diagonal: of a column the rows from start[column] to start[column + 1], in increasing order. */
+struct FactorColumns {
+    std::vector<size_t> start = {0};
+    std::vector<int> rows;
+    int getNumColumns() const {
+        return (int) start.size() - 1;
+    }
+    size_t getCount(int column) const {
+        return start[column + 1] - start[column];
+    }
+    const int* begin(int column) const {
+        return rows.data() + start[column];
+    }
+    const int* end(int column) const {
+        return rows.data() + start[column + 1];
+    }
+    /** The first of them, which is the parent in the elimination tree, or NONE. */
+    int getParent(int column) const {
+        return getCount(column) == 0 ? EliminationTree::NONE : *begin(column);
+    }
+    /** Where an entry is among all rows. */
+    size_t find(int row, int column) const {
+        return (size_t) (std::lower_bound(begin(column), end(column), row) - rows.data());
+    }
+    /** Add those of a matrix that has nothing to do with this one, neither of them with outer rows. */
+    void append(const FactorColumns& other);
+};
+
+/**
+ * Find them for the elimination of the first columns; time in proportion to their number.
+ *
+ * @param numColumns    the number of columns that are eliminated, in this order
+ * @param numOuter      the number of rows behind them that stay
+ * @param entries       the entries of the matrix, those between outer rows may be among them
+ */
+FactorColumns findFactorColumns(int numColumns, int numOuter, const MatrixEntries& entries);
 
 /** An order in which the rows of a matrix are eliminated. */
 struct EliminationOrder {

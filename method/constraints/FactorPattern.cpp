@@ -13,84 +13,39 @@ namespace {
 const double MAX_ZEROS = 0.15;
 const size_t FEW_ZEROS = 64;
 
-void sortUnique(vector<int>& rows) {
-    std::sort(rows.begin(), rows.end());
-    rows.erase(std::unique(rows.begin(), rows.end()), rows.end());
-}
-
 } // namespace
 
-FactorPattern::FactorPattern(int numColumns, int numOuter, const MatrixEntries& entries) :
-        numColumns(numColumns), numOuter(numOuter), firstOuterValue(0) {
-    const EliminationTree tree = findEliminationTree(numColumns + numOuter, entries);
-    const auto wide = std::find_if(tree.counts.begin(), tree.counts.begin() + numColumns,
-                                   [](int count) { return count >= EliminationOrder::WIDE; });
-    numNarrow = (int) (wide - tree.counts.begin());
-    vector<vector<int>> own(numColumns); // the matrix's entries of each column
-    for (const auto& entry : entries)
-        own[entry.second].push_back(entry.first);
-    findNarrowColumns(tree, own);
-    findPanels(tree, own);
+FactorPattern::FactorPattern(const FactorColumns& columns, int numOuter) :
+        numColumns(columns.getNumColumns()), numOuter(numOuter), numNarrow(0), firstOuterValue(0) {
+    while (numNarrow < numColumns && columns.getCount(numNarrow) < (size_t) EliminationOrder::WIDE)
+        numNarrow++;
+    columnStart.assign(columns.start.begin(), columns.start.begin() + numNarrow + 1);
+    rows.assign(columns.rows.begin(), columns.rows.begin() + columnStart.back());
+    for (int column = 0; column < numNarrow; column++)
+        numOuterEntries.push_back(
+            (int) (columns.end(column) - std::lower_bound(columns.begin(column), columns.end(column), numColumns)));
+    findPanels(columns);
     findSources();
     findUpdates();
 }
 
-void FactorPattern::findNarrowColumns(const EliminationTree& tree, const vector<vector<int>>& own) {
-    vector<vector<int>> children(numNarrow);
-    columnStart.assign(1, 0);
-    for (int column = 0; column < numNarrow; column++) {
-        // What the columns below it in the elimination tree leave, beside the matrix's own entries.
-        vector<int> list = own[column];
-        for (int child : children[column])
-            list.insert(list.end(), rows.begin() + columnStart[child] + 1, rows.begin() + columnStart[child + 1]);
-        sortUnique(list);
-        rows.insert(rows.end(), list.begin(), list.end());
-        columnStart.push_back(rows.size());
-        numOuterEntries.push_back((int) (list.end() - std::lower_bound(list.begin(), list.end(), numColumns)));
-        const int parent = tree.parent[column];
-        if (parent != EliminationTree::NONE && parent < numNarrow)
-            children[parent].push_back(column);
-    }
-}
-
-void FactorPattern::findPanels(const EliminationTree& tree, const vector<vector<int>>& own) {
+void FactorPattern::findPanels(const FactorColumns& columns) {
     size_t numValues = rows.size() + numNarrow;
-    panelOf.assign(numColumns - numNarrow, 0);
-    vector<vector<int>> narrowChildren(numColumns - numNarrow), panelChildren(numColumns - numNarrow);
-    for (int column = 0; column < numNarrow; column++) {
-        const int parent = tree.parent[column];
-        if (parent >= numNarrow && parent < numColumns)
-            narrowChildren[parent - numNarrow].push_back(column);
-    }
     for (int first = numNarrow; first < numColumns;) {
         Panel panel = {first, first + 1, panelRows.size(), 0, numValues};
-        size_t needed = 1 + (size_t) tree.counts[first];
-        while (panel.end < numColumns && tree.parent[panel.end - 1] == panel.end) {
-            const size_t width = (size_t) panel.getWidth() + 1, count = (size_t) tree.counts[panel.end];
+        size_t needed = 1 + columns.getCount(first);
+        while (panel.end < numColumns && columns.getParent(panel.end - 1) == panel.end) {
+            const size_t width = (size_t) panel.getWidth() + 1, count = columns.getCount(panel.end);
             const size_t stored = width * (width + 1) / 2 + width * count, used = needed + count + 1;
             if (stored - used > std::max(FEW_ZEROS, (size_t) (MAX_ZEROS * (double) stored)))
                 break;
             needed = used;
             panel.end++;
         }
-        vector<int> list;
-        auto addBelow = [&](auto begin, auto end) {
-            list.insert(list.end(), std::lower_bound(begin, end, panel.end), end);
-        };
-        for (int column = panel.first; column < panel.end; column++) {
-            panelOf[column - numNarrow] = (int) panels.size();
-            std::copy_if(own[column].begin(), own[column].end(), std::back_inserter(list),
-                         [&](int row) { return row >= panel.end; });
-            for (int child : narrowChildren[column - numNarrow])
-                addBelow(rows.begin() + columnStart[child], rows.begin() + columnStart[child + 1]);
-            for (int child : panelChildren[column - numNarrow])
-                addBelow(panelRows.begin() + panels[child].firstRow, panelRows.begin() + panels[child].endRow);
-        }
-        sortUnique(list);
-        panelRows.insert(panelRows.end(), list.begin(), list.end());
+        panelOf.insert(panelOf.end(), panel.getWidth(), (int) panels.size());
+        // The last column has the rows of those before it too, whose elimination has gone through it.
+        panelRows.insert(panelRows.end(), columns.begin(panel.end - 1), columns.end(panel.end - 1));
         panel.endRow = panelRows.size();
-        if (!list.empty() && list[0] < numColumns)
-            panelChildren[list[0] - numNarrow].push_back((int) panels.size());
         numValues += (size_t) panel.getWidth() * panel.getHeight();
         panels.push_back(panel);
         first = panel.end;

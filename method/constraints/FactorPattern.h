@@ -40,11 +40,10 @@ public:
     FactorPattern() : numColumns(0), numOuter(0), numNarrow(0), firstOuterValue(0) {
     }
     /**
-     * @param numColumns    the number of columns to be eliminated
-     * @param numOuter      the number of rows behind them
-     * @param entries       the entries of the matrix below the diagonal, in these columns; several for one place count once
+     * @param columns     the entries of the columns that are eliminated
+     * @param numOuter    the number of rows behind them
      */
-    FactorPattern(int numColumns, int numOuter, const MatrixEntries& entries);
+    explicit FactorPattern(const FactorColumns& columns, int numOuter = 0);
 
     int getNumColumns() const {
         return numColumns;
@@ -99,8 +98,7 @@ public:
     }
 
 private:
-    void findNarrowColumns(const EliminationTree& tree, const std::vector<std::vector<int>>& own);
-    void findPanels(const EliminationTree& tree, const std::vector<std::vector<int>>& own);
+    void findPanels(const FactorColumns& columns);
     void findSources();
     void findUpdates();
     int numColumns, numOuter, numNarrow;

@@ -1,14 +1,17 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// How clusters are found, cut and eliminated, against elimination in a dense matrix of what is zero and what is not.
+// How clusters are found, sorted into kinds, cut and eliminated, against searches by definition and elimination in a dense matrix of
+// what is zero and what is not.
 
+#include "Examples.h"
 #include "TestSupport.h"
 #include "constraints/ClusterLayout.h"
 #include <algorithm>
 #include <set>
 
 using namespace OpenMMVRattle;
+using OpenMM::Vec3;
 using std::vector;
 
 namespace {
@@ -16,7 +19,7 @@ namespace {
 typedef vector<vector<int>> Particles; // of each constraint
 
 // A backbone of particles with an arm at each; a ring every so often; numbers of particles that are not neighbours.
-Particles makeComb(int backbone, int arm, int ring) {
+Particles makeMolecule(int backbone, int arm, int ring) {
     Particles result;
     auto number = [&](int i) { return 10 + 7 * i; };
     for (int i = 0; i < backbone; i++) {
@@ -63,14 +66,16 @@ void testElimination(const Particles& particlesOf, const ClusterCut& cut, Cluste
     ASSERT_EQUAL(count, (int) order.size());
     ASSERT_EQUAL(count, (int) levels.size());
 
-    vector<vector<char>> isCoupled(count, vector<char>(count, false));
+    vector<vector<char>> isCoupled(count, vector<char>(count, false)), isLeft; // by the pieces
     vector<std::set<int>> borders(found.pieces.size());
     for (int a = 0; a < count; a++)
         for (int b = 0; b < a; b++)
             for (int i : particlesOf[order[a]])
                 if (std::count(particlesOf[order[b]].begin(), particlesOf[order[b]].end(), i) > 0)
                     isCoupled[a][b] = true;
-    for (int b = 0; b < count; b++)
+    for (int b = 0; b < count; b++) {
+        if (b == firstJoint)
+            isLeft = isCoupled;
         for (int a = b + 1; a < count; a++) {
             if (!isCoupled[a][b])
                 continue;
@@ -84,12 +89,41 @@ void testElimination(const Particles& particlesOf, const ClusterCut& cut, Cluste
                 ASSERT(levels[a] > levels[b]);
             }
         }
-    for (size_t p = 0; p < found.pieces.size(); p++)
-        ASSERT(vector<int>(borders[p].begin(), borders[p].end()) == found.pieces[p].borders);
+    }
+    // Exactly those entries are listed, by rows of the whole.
+    vector<vector<char>> isListed(count, vector<char>(count, false)), isListedLeft = isListed;
+    auto list = [&](const FactorColumns& columns, int first, auto rowOf) {
+        for (int column = 0; column < columns.getNumColumns(); column++) {
+            ASSERT(std::is_sorted(columns.begin(column), columns.end(column)));
+            for (const int* row = columns.begin(column); row != columns.end(column); ++row) {
+                ASSERT(!isListed[rowOf(*row)][first + column]);
+                ASSERT_EQUAL((size_t) (row - columns.rows.data()), columns.find(*row, column));
+                isListed[rowOf(*row)][first + column] = true;
+            }
+        }
+    };
+    int first = 0;
+    for (size_t p = 0; p < found.pieces.size(); p++) {
+        const ClusterElimination::Piece& piece = found.pieces[p];
+        ASSERT(vector<int>(borders[p].begin(), borders[p].end()) == piece.borders);
+        const int size = (int) piece.constraints.size();
+        auto rowOf = [&](int row) { return row < size ? first + row : firstJoint + piece.borders[row - size]; };
+        list(piece.columns, first, rowOf);
+        ASSERT(std::is_sorted(piece.borderEntries.begin(), piece.borderEntries.end()));
+        for (const auto& entry : piece.borderEntries)
+            isListedLeft[rowOf(entry.first)][rowOf(entry.second)] = true;
+        first += size;
+    }
+    list(found.jointColumns, firstJoint, [&](int row) { return firstJoint + row; });
+    for (int a = 0; a < count; a++)
+        for (int b = 0; b < a; b++) {
+            ASSERT_EQUAL((int) isCoupled[a][b], (int) isListed[a][b]);
+            ASSERT(b < firstJoint || isLeft[a][b] == isListedLeft[a][b]);
+        }
 }
 
 void testEliminations() {
-    const Particles comb = makeComb(90, 2, 0), rings = makeComb(90, 2, 7), triples = makeTriples(200);
+    const Particles comb = makeMolecule(90, 2, 0), rings = makeMolecule(90, 2, 7), triples = makeTriples(200);
     for (ClusterElimination::Goal goal : {ClusterElimination::LeastFill, ClusterElimination::FewLevels})
         for (const Particles& cluster : {comb, rings, triples}) {
             testElimination(cluster, leaveWhole(cluster), goal);
@@ -98,7 +132,7 @@ void testEliminations() {
             testElimination(cluster, cut, goal);
         }
     // Few levels where there can be few.
-    const Particles chain = makeComb(1500, 0, 0);
+    const Particles chain = makeMolecule(1500, 0, 0);
     ASSERT(ClusterElimination(chain, leaveWhole(chain), ClusterElimination::FewLevels).pieces[0].numLevels <= 11);
     ASSERT(!ClusterElimination(chain, leaveWhole(chain), ClusterElimination::FewLevels).hasWideColumns);
     Particles star;
@@ -107,8 +141,126 @@ void testEliminations() {
     ASSERT(ClusterElimination(star, leaveWhole(star), ClusterElimination::LeastFill).hasWideColumns);
 }
 
+Particles findMovingParticles(const Example& e) {
+    Particles result;
+    for (const DistanceConstraint& c : e.distances)
+        result.push_back({c.particle1, c.particle2});
+    for (const ExpressionConstraint& c : e.expressions)
+        result.push_back(c.particles);
+    for (vector<int>& list : result)
+        list.erase(std::remove_if(list.begin(), list.end(), [&](int i) { return e.masses[i] == 0; }), list.end());
+    return result;
+}
+
+// Each particle that moves and each constraint between such is in one cluster; all are as the graph of their kind says; and a cluster
+// is what hangs together.
+void testLayout(const Example& e) {
+    const ClusterLayout layout(e.masses, e.distances, e.expressions);
+    const Particles particlesOf = findMovingParticles(e);
+    vector<int> clusterOf(e.masses.size(), -1), clusterOfConstraint(particlesOf.size(), -1);
+    ASSERT_EQUAL(0, layout.kinds[0].getNumConstraints());
+    for (int i : layout.kinds[0].particles) {
+        ASSERT_EQUAL(-1, clusterOf[i]);
+        clusterOf[i] = -2;
+    }
+    vector<int> numClusters(layout.kinds.size(), 0);
+    for (size_t c = 0; c < layout.clusters.size(); c++) {
+        const ClusterLayout::Cluster& cluster = layout.clusters[c];
+        const ClusterKind& kind = layout.kinds[cluster.kind];
+        numClusters[cluster.kind]++;
+        ASSERT(cluster.number < kind.getNumClusters());
+        for (int place = 0; place < kind.numParticles; place++) {
+            int& mine = clusterOf[kind.getParticle(cluster.number, place)];
+            ASSERT_EQUAL(-1, mine);
+            mine = (int) c;
+        }
+        bool hasExpressions = false;
+        for (int place = 0; place < kind.getNumConstraints(); place++) {
+            const int k = kind.getConstraint(cluster.number, place);
+            ASSERT_EQUAL(-1, clusterOfConstraint[k]);
+            clusterOfConstraint[k] = (int) c;
+            const bool isExpression = k >= (int) e.distances.size();
+            ASSERT(isExpression || !hasExpressions);
+            hasExpressions = isExpression;
+            vector<int> found, expected = particlesOf[k];
+            for (int i : kind.particlesOf[place])
+                found.push_back(kind.getParticle(cluster.number, i));
+            if (!isExpression && found != expected)
+                std::swap(expected[0], expected[1]);
+            ASSERT(found == expected);
+        }
+        ASSERT_EQUAL(kind.hasExpressions, hasExpressions);
+        if (cluster.number > 0)
+            ASSERT(kind.getParticle(cluster.number - 1, 0) < kind.getParticle(cluster.number, 0));
+        // From one particle all others are reached.
+        std::set<int> reached = {kind.getParticle(cluster.number, 0)};
+        for (size_t before = 0; before < reached.size();) {
+            before = reached.size();
+            for (const vector<int>& list : particlesOf)
+                if (std::any_of(list.begin(), list.end(), [&](int i) { return reached.count(i) > 0; }))
+                    reached.insert(list.begin(), list.end());
+        }
+        ASSERT_EQUAL((size_t) kind.numParticles, reached.size());
+    }
+    for (size_t k = 0; k < particlesOf.size(); k++) {
+        ASSERT_EQUAL(particlesOf[k].empty(), clusterOfConstraint[k] == -1);
+        for (int i : particlesOf[k])
+            ASSERT_EQUAL(clusterOfConstraint[k], clusterOf[i]);
+    }
+    for (size_t i = 0; i < e.masses.size(); i++)
+        ASSERT_EQUAL(e.masses[i] == 0, clusterOf[i] == -1);
+    for (size_t kind = 1; kind < layout.kinds.size(); kind++) {
+        ASSERT_EQUAL(layout.kinds[kind].getNumClusters(), numClusters[kind]);
+        const ClusterElimination& elimination = layout.kinds[kind].elimination;
+        if (elimination.pieces.size() > 1)
+            continue;
+        vector<int> sorted = elimination.pieces[0].constraints;
+        std::sort(sorted.begin(), sorted.end());
+        for (int k = 0; k < layout.kinds[kind].getNumConstraints(); k++)
+            ASSERT_EQUAL(k, sorted[k]);
+    }
+}
+
+void testLayouts() {
+    Example e = makeComb(60);
+    const int fixed = e.add(0, Vec3()), other = e.add(0, Vec3(1, 0, 0));
+    e.join(fixed, other);
+    testLayout(e);
+    testLayout(makeRod(8));
+    testLayout(Example());
+    // Equal molecules that are written in other orders are of one kind: waters, groups of atoms on one, rings with a tail.
+    const vector<vector<std::pair<int, int>>> graphs = {
+        {{0, 1}, {0, 2}, {1, 2}}, {{0, 1}, {0, 2}, {0, 3}}, {{0, 1}}, {{0, 1}, {0, 2}, {0, 3}, {0, 4}}};
+    Example molecules;
+    for (int copy = 0; copy < 20; copy++)
+        for (const auto& graph : graphs) {
+            const int first = (int) molecules.masses.size(), size = graph.back().second + 1;
+            vector<int> order(size);
+            for (int i = 0; i < size; i++)
+                order[i] = first + i;
+            for (int i = size - 1; i > 0; i--)
+                std::swap(order[i], order[molecules.generator() % (i + 1)]);
+            for (int i = 0; i < size; i++)
+                molecules.add(1, molecules.randomVector(1));
+            for (const auto& pair : graph)
+                molecules.distances.push_back({order[pair.first], order[pair.second], pair.first == 1 ? 0.16 : 0.1});
+        }
+    molecules.shuffleDistances();
+    testLayout(molecules);
+    const ClusterLayout layout(molecules.masses, molecules.distances, {});
+    ASSERT_EQUAL(1 + graphs.size(), layout.kinds.size());
+    for (const ClusterKind& kind : layout.kinds) {
+        ASSERT(kind.isSmall());
+        if (kind.numParticles != 3 || kind.getNumConstraints() != 3)
+            continue;
+        for (int water = 0; water < kind.getNumClusters(); water++)
+            for (int k = 0; k < 3; k++)
+                ASSERT_EQUAL(k == 2 ? 0.16 : 0.1, layout.distances[kind.getConstraint(water, k)].length);
+    }
+}
+
 } // namespace
 
 int main() {
-    return runTests({{"eliminations", testEliminations}});
+    return runTests({{"eliminations", testEliminations}, {"layouts", testLayouts}});
 }

@@ -113,7 +113,9 @@ void testOrder(int size, const MatrixEntries& entries, bool isWide) {
     for (int column = 0; column < size; column++)
         ASSERT(column >= order.numNarrow || tree.counts[column] < EliminationOrder::WIDE);
     // Memory in proportion to the entries of L.
-    const FactorPattern pattern(size, 0, reordered);
+    const FactorColumns columns = findFactorColumns(size, 0, reordered);
+    ASSERT_EQUAL(tree.numEntries, columns.rows.size());
+    const FactorPattern pattern(columns);
     ASSERT_EQUAL(order.numNarrow, pattern.getNumNarrow());
     ASSERT(pattern.getNumValues() <=
            2.4 * (double) (tree.numEntries + size)); // the diagonal blocks of panels are whole
@@ -197,7 +199,7 @@ MatrixEntries makeMolecule(int backbone, int& size) {
 void testFactor(int size, const MatrixEntries& given) {
     const MatrixEntries entries = reorder(given, findEliminationOrder(size, given).rows);
     const Eigen::MatrixXd matrix = makeMatrix(size, entries);
-    const FactorPattern pattern(size, 0, entries);
+    const FactorPattern pattern(findFactorColumns(size, 0, entries));
     SparseFactor factor(pattern);
     const Eigen::VectorXd right = Eigen::VectorXd::LinSpaced(size, -1, 2);
     for (int repeat = 0; repeat < 2; repeat++) { // the second time on top of the first
@@ -232,7 +234,7 @@ void testOuterRows(int size, int numOuter, const MatrixEntries& given) {
     std::sort(entries.begin(), entries.end());
     entries.erase(std::unique(entries.begin(), entries.end()), entries.end());
     const Eigen::MatrixXd matrix = makeMatrix(size + numOuter, entries);
-    const FactorPattern pattern(size, numOuter, entries);
+    const FactorPattern pattern(findFactorColumns(size, numOuter, entries), numOuter);
     SparseFactor factor(pattern);
     put(matrix, entries, pattern, factor);
     ASSERT_EQUAL(SparseFactor::REGULAR, factor.factorize(1e-10));

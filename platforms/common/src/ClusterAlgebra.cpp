@@ -3,7 +3,6 @@
 
 #include "ClusterAlgebra.h"
 #include <algorithm>
-#include <set>
 
 using namespace OpenMMVRattle;
 using std::string;
@@ -22,39 +21,30 @@ string at(const char* array, int i, int j) {
 
 } // namespace
 
-// Elimination by least degree; the entries that it fills in are found by eliminating the graph.
-ClusterAlgebra::ClusterAlgebra(const vector<std::pair<int, int>>& pairs) : pairs(pairs) {
-    const int n = (int) pairs.size();
-    vector<std::set<int>> neighbours(n);
-    for (int k = 0; k < n; k++)
-        for (int l = 0; l < n; l++)
-            if (k != l && !weight(k, l).empty())
-                neighbours[k].insert(l);
-    vector<bool> isEliminated(n, false);
-    vector<std::set<int>> columns(n);
-    for (int p = 0; p < n; p++) {
-        int next = -1;
+// The entries are those of the kind's elimination. Of the orders that have the same ones, one along a chain rather than from both ends lets
+// fewer numbers wait in registers: maximum cardinality search (Tarjan and Yannakakis, SIAM J. Comput. 13, 1984) from the last constraint.
+ClusterAlgebra::ClusterAlgebra(const ClusterKind& kind) : pairs(kind.particlesOf), order(kind.getNumConstraints()) {
+    const ClusterElimination::Piece& piece = kind.elimination.pieces[0];
+    const int n = kind.getNumConstraints();
+    vector<int> columnOf(n), weights(n, 0);
+    for (int column = 0; column < n; column++)
+        columnOf[piece.constraints[column]] = column;
+    auto isCoupled = [&](int k, int l) {
+        const int row = std::max(columnOf[k], columnOf[l]), column = std::min(columnOf[k], columnOf[l]);
+        return k == l || std::binary_search(piece.columns.begin(column), piece.columns.end(column), row);
+    };
+    for (int p = n - 1; p >= 0; p--) {
+        order[p] = (int) (weights.rend() - std::max_element(weights.rbegin(), weights.rend())) - 1;
         for (int k = 0; k < n; k++)
-            if (!isEliminated[k] && (next < 0 || neighbours[k].size() < neighbours[next].size()))
-                next = k;
-        order.push_back(next);
-        isEliminated[next] = true;
-        columns[p] = neighbours[next];
-        for (int i : neighbours[next]) {
-            neighbours[i].erase(next);
-            for (int j : neighbours[next])
-                if (i != j)
-                    neighbours[i].insert(j);
-        }
+            weights[k] += isCoupled(k, order[p]) && weights[k] >= 0 ? 1 : 0;
+        weights[order[p]] = -1;
     }
     entries.assign(n, vector<int>(n, -1));
     int count = 0;
-    for (int p = 0; p < n; p++) {
-        entries[p][p] = count++;
-        for (int i = p + 1; i < n; i++)
-            if (columns[p].count(order[i]) > 0)
+    for (int p = 0; p < n; p++)
+        for (int i = p; i < n; i++)
+            if (isCoupled(order[i], order[p]))
                 entries[i][p] = entries[p][i] = count++;
-    }
 }
 
 int ClusterAlgebra::getNumEntries() const {
@@ -70,10 +60,9 @@ string ClusterAlgebra::weight(int k, int l) const {
     string sum;
     for (int endK = 0; endK < 2; endK++)
         for (int endL = 0; endL < 2; endL++) {
-            const int atomK = endK == 0 ? pairs[k].first : pairs[k].second;
-            const int atomL = endL == 0 ? pairs[l].first : pairs[l].second;
-            if (atomK == atomL)
-                sum += (endK == endL ? (sum.empty() ? "" : " + ") : (sum.empty() ? "-" : " - ")) + at("w", atomK);
+            if (pairs[k][endK] == pairs[l][endL])
+                sum +=
+                    (endK == endL ? (sum.empty() ? "" : " + ") : (sum.empty() ? "-" : " - ")) + at("w", pairs[k][endK]);
         }
     return sum.empty() ? sum : "(" + sum + ")";
 }

@@ -4,19 +4,19 @@
 #ifndef OPENMMVRATTLE_CLUSTERALGEBRA_H_
 #define OPENMMVRATTLE_CLUSTERALGEBRA_H_
 
+#include "constraints/ClusterLayout.h"
 #include <string>
-#include <utility>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
  * Writes the linear algebra of a small cluster of distance constraints as straight-line code: only those entries of K = G M^-1 G^T
- * and of its factor that the constraint graph makes non-zero are named, in an order of elimination that keeps them few.
+ * and of its factor that the constraint graph makes non-zero are named, in the order of elimination of its kind, which keeps them few.
  */
 class ClusterAlgebra {
 public:
-    explicit ClusterAlgebra(const std::vector<std::pair<int, int>>& pairs);
+    explicit ClusterAlgebra(const ClusterKind& kind);
     /** The functions that kernels/cluster.cc asks for. */
     std::string write() const;
     /** The number of entries of the factor L, the diagonal included. */
@@ -32,8 +32,8 @@ private:
     std::string writeSolve() const;
     std::string writeNewton() const;
     std::string writeMove() const;
-    std::vector<std::pair<int, int>> pairs;
-    std::vector<int> order;                // constraints in the order of elimination
+    const std::vector<std::vector<int>>& pairs; // the particles of each constraint
+    std::vector<int> order;                     // constraints in the order of elimination
     std::vector<std::vector<int>> entries; // by places in that order: the index in L, -1 for none
 };
 

@@ -60,7 +60,7 @@ CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::Com
     }
     compute.initializeContexts();
     if (areKnown && DeviceSteps::canTake(settings.expressions))
-        steps = std::make_unique<DeviceSteps>(compute, context.getSystem(), settings.expressions);
+        steps = std::make_unique<DeviceSteps>(compute, method.getConstraintSystem().getLayout(), settings.expressions);
     ContextSelector selector(compute);
     compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context
 }

@@ -66,23 +66,12 @@ void addEmpty(ComputeKernel& kernel, int count) {
 
 } // namespace
 
-DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
-                         const vector<ExpressionConstraint>& expressions) :
-        DeviceSteps(context, system,
-                    expressions.empty() ? nullptr : std::make_unique<ExpressionSteps>(context, system, expressions)) {
-}
-
-DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
-                         std::unique_ptr<ExpressionSteps>&& expressions) :
-        DeviceSteps(context,
-                    ClusterKinds(system, expressions ? expressions->getClusters().getMembers() : vector<char>()),
-                    std::move(expressions)) {
-}
-
-DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters,
-                         std::unique_ptr<ExpressionSteps>&& someExpressions) :
-        context(context), expressions(std::move(someExpressions)), kinds(clusters.small),
-        large(clusters.large, findLimits(context)), settings(),
+DeviceSteps::DeviceSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout,
+                         const vector<ExpressionConstraint>& someExpressions) :
+        context(context),
+        expressions(someExpressions.empty() ? nullptr
+                                            : std::make_unique<ExpressionSteps>(context, layout, someExpressions)),
+        layout(layout), large(layout, findLimits(context)), settings(),
         isMixed(context.getUseMixedPrecision() || context.getUseDoublePrecision()),
         isWide(context.getSupportsDoublePrecision()),
         groupSize(StepProgram::getGroupSize(!large.isEmpty() || expressions)), numGroups(0), numPartials(0),
@@ -107,13 +96,13 @@ void DeviceSteps::initialize() {
     // An array has at least one element.
     vector<int> atomData;
     vector<double> lengthData;
-    for (const ClusterKind& kind : kinds) {
-        for (int i = 0; i < kind.numAtoms; i++)
-            for (const vector<int>& cluster : kind.atoms)
-                atomData.push_back(cluster[i]);
-        for (size_t k = 0; k < kind.pairs.size(); k++)
-            for (const vector<double>& cluster : kind.lengths)
-                lengthData.push_back(cluster[k]);
+    for (const ClusterKind* kind : StepProgram::findSmallKinds(layout)) {
+        for (int i = 0; i < kind->numParticles; i++)
+            for (int cluster = 0; cluster < kind->getNumClusters(); cluster++)
+                atomData.push_back(kind->getParticle(cluster, i));
+        for (int k = 0; k < kind->getNumConstraints(); k++)
+            for (int cluster = 0; cluster < kind->getNumClusters(); cluster++)
+                lengthData.push_back(layout.distances[kind->getConstraint(cluster, k)].length);
     }
     atomData.resize(std::max<size_t>(1, atomData.size()));
     lengthData.resize(std::max<size_t>(1, lengthData.size()));
@@ -214,7 +203,8 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
 }
 
 void DeviceSteps::compile(StepProgram::Update update) {
-    std::unique_ptr<StepProgram> next(new StepProgram(kinds, large, expressions ? &expressions->getClusters() : nullptr,
+    std::unique_ptr<StepProgram> next(new StepProgram(layout, large,
+                                                      expressions ? &expressions->getClusters() : nullptr,
                                                       large.getNumThreads(), settings.terms, update, isMixed, isWide));
     const bool isFirst = program == nullptr;
     program.swap(next);

@@ -4,7 +4,6 @@
 #ifndef OPENMMVRATTLE_DEVICESTEPS_H_
 #define OPENMMVRATTLE_DEVICESTEPS_H_
 
-#include "ClusterKinds.h"
 #include "ExpressionSteps.h"
 #include "LargeClusters.h"
 #include "StepProgram.h"
@@ -73,7 +72,11 @@ public:
 
     /** Whether all constraints are of those that the device can solve. */
     static bool canTake(const std::vector<ExpressionConstraint>& expressions);
-    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+    /**
+     * @param layout         the clusters, which must live as long as this
+     * @param expressions    the constraints among them that are given so
+     */
+    DeviceSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout,
                 const std::vector<ExpressionConstraint>& expressions = {});
     /** Take over settings, after which begin() is due. */
     void setSettings(const Settings& settings);
@@ -141,10 +144,6 @@ public:
     }
 
 private:
-    DeviceSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
-                std::unique_ptr<ExpressionSteps>&& expressions);
-    DeviceSteps(OpenMM::ComputeContext& context, const ClusterKinds& clusters,
-                std::unique_ptr<ExpressionSteps>&& expressions);
     struct Kernels {
         ExpressionSteps::Kernels expressions;
         OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
@@ -177,7 +176,7 @@ private:
     Report fill(const std::vector<double>& block);
     OpenMM::ComputeContext& context;
     std::unique_ptr<ExpressionSteps> expressions; // or null
-    std::vector<ClusterKind> kinds;
+    const ClusterLayout& layout;
     LargeClusters large;
     Settings settings;
     std::unique_ptr<StepProgram> program;

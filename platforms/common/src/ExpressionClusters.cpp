@@ -4,9 +4,7 @@
 #include "ExpressionClusters.h"
 #include "ExpressionCode.h"
 #include "ExpressionTexts.h"
-#include "constraints/EliminationOrder.h"
 #include <algorithm>
-#include <map>
 #include <numeric>
 #include <set>
 #include <utility>
@@ -59,12 +57,6 @@ const size_t MANY_OPERATIONS = 2000;
 const char INLINE[] = "inline ";
 const char DISTANCE_EXPRESSION[] = "0.5*((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2 - length^2)";
 
-int findRoot(vector<int>& parents, int i) {
-    while (parents[i] != i)
-        i = parents[i] = parents[parents[i]];
-    return i;
-}
-
 } // namespace
 
 struct ExpressionClusters::Row {
@@ -72,33 +64,25 @@ struct ExpressionClusters::Row {
     vector<int> particles;
 };
 
-ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vector<ExpressionConstraint>& given) :
-        isMember(system.getNumParticles(), false), numParameters(0), numConstraints(0), numLevels(0), numWork(0),
-        numFactorEntries(0) {
+// Clusters one after the other, each in its own order of elimination.
+struct ExpressionClusters::Part {
+    vector<Row> rows;
+    vector<int> firstRows; // of each cluster
+    vector<int> levels;    // of each row
+    FactorColumns columns;
+};
+
+ExpressionClusters::ExpressionClusters(const ClusterLayout& layout, const vector<ExpressionConstraint>& given) :
+        numParameters(0), numConstraints(0), numLevels(0), numWork(0), numFactorEntries(0) {
     if (given.empty())
         return;
     const vector<ExpressionConstraint> expressions = shareTexts(given);
     kindOf({DISTANCE_EXPRESSION, {0, 1}, {{"length", 1.0}}});
-    const int numParticles = system.getNumParticles();
-    vector<double> masses(numParticles);
-    for (int i = 0; i < numParticles; i++)
-        masses[i] = system.getParticleMass(i);
-    vector<int> parents(numParticles);
-    std::iota(parents.begin(), parents.end(), 0);
-    vector<Row> rows;
-    auto add = [&](const Row& row) {
-        int first = -1;
-        for (int i : row.particles)
-            if (masses[i] > 0) {
-                first = first < 0 ? i : first;
-                parents[findRoot(parents, i)] = findRoot(parents, first);
-            }
-        rows.push_back(row);
-    };
+    vector<int> kindsOfExpressions;
     for (const ExpressionConstraint& constraint : expressions) {
-        const int expression = (int) firstParameters.size();
+        const size_t expression = firstParameters.size();
         firstParameters.push_back((int) parameters.size());
-        add({kindOf(constraint), (int) parameters.size(), expression, constraint.particles});
+        kindsOfExpressions.push_back(kindOf(constraint));
         for (size_t i = 0; i < given[expression].parameters.size(); i++) // numbers of the text come behind them
             givenParameters.push_back((int) (parameters.size() + i));
         for (const auto& parameter : constraint.parameters)
@@ -107,42 +91,38 @@ ExpressionClusters::ExpressionClusters(const OpenMM::System& system, const vecto
     rowOfExpression.resize(expressions.size());
     numParameters = (int) parameters.size();
     parameters.resize(2 * numParameters, 0.0);
-    for (int k = 0; k < system.getNumConstraints(); k++) {
-        int i, j;
-        double length;
-        system.getConstraintParameters(k, i, j, length);
-        if (masses[i] == 0 && masses[j] == 0)
-            continue;
-        add({DISTANCE, (int) parameters.size(), NONE, {i, j}});
-        parameters.push_back(length); // of no use to those that are in no such cluster
-    }
-    auto rootOf = [&](const Row& row) {
-        for (int i : row.particles)
-            if (masses[i] > 0)
-                return findRoot(parents, i);
-        return -1; // refused when the constraint was checked
+    const int numDistances = (int) layout.distances.size();
+    auto makeRow = [&](int k) {
+        const int e = k - numDistances;
+        if (e >= 0)
+            return Row{kindsOfExpressions[e], firstParameters[e], e, expressions[e].particles};
+        parameters.push_back(layout.distances[k].length);
+        return Row{DISTANCE,
+                   (int) parameters.size() - 1,
+                   NONE,
+                   {layout.distances[k].particle1, layout.distances[k].particle2}};
     };
-    std::set<int> roots;
-    for (size_t e = 0; e < expressions.size(); e++)
-        roots.insert(rootOf(rows[e]));
-    for (int i = 0; i < numParticles; i++)
-        isMember[i] = masses[i] > 0 && roots.count(findRoot(parents, i)) > 0;
-    std::map<int, vector<Row>> clusters;
-    for (const Row& row : rows)
-        if (roots.count(rootOf(row)) > 0)
-            clusters[rootOf(row)].push_back(row);
-    vector<Row> open;
-    vector<int> firstRows; // of each cluster
-    for (const auto& cluster : clusters) {
-        if (!open.empty() && open.size() + cluster.second.size() > (size_t) PART_SIZE) {
-            addPart(open, firstRows, masses);
-            open.clear();
-            firstRows.clear();
+    std::map<int, ClusterElimination> eliminations; // of each kind
+    Part open;
+    for (const ClusterLayout::Cluster& cluster : layout.clusters) {
+        const ClusterKind& kind = layout.kinds[cluster.kind];
+        if (!kind.hasExpressions)
+            continue;
+        if (eliminations.count(cluster.kind) == 0)
+            eliminations[cluster.kind] =
+                ClusterElimination(kind.particlesOf, leaveWhole(kind.particlesOf), ClusterElimination::FewLevels);
+        if (!open.rows.empty() && (int) open.rows.size() + kind.getNumConstraints() > PART_SIZE) {
+            addPart(open, layout.inverseMasses);
+            open = Part();
         }
-        firstRows.push_back((int) open.size());
-        open.insert(open.end(), cluster.second.begin(), cluster.second.end());
+        open.firstRows.push_back((int) open.rows.size());
+        const ClusterElimination::Piece& piece = eliminations[cluster.kind].pieces[0];
+        for (int place : piece.constraints)
+            open.rows.push_back(makeRow(kind.getConstraint(cluster.number, place)));
+        open.levels.insert(open.levels.end(), piece.levels.begin(), piece.levels.end());
+        open.columns.append(piece.columns);
     }
-    addPart(open, firstRows, masses);
+    addPart(open, layout.inverseMasses);
 }
 
 ExpressionClusters::Kind ExpressionClusters::nameKind(const ExpressionConstraint& constraint) {
@@ -175,7 +155,9 @@ void ExpressionClusters::writeParameters(int expression, const std::map<string, 
         all[place++] = value.second;
 }
 
-void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& firstRows, const vector<double>& masses) {
+void ExpressionClusters::addPart(const Part& part, const vector<double>& inverseMasses) {
+    const vector<Row>& rows = part.rows;
+    const vector<int>& firstRows = part.firstRows;
     const int numRows = (int) rows.size();
     // The particles of one cluster after those of another; what does not move may be in several, and comes last.
     vector<int> atoms, clusterStart;
@@ -188,7 +170,7 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
                 nextCluster++;
             }
             for (int i : rows[k].particles)
-                if ((masses[i] > 0) == isMoving && placeOf.emplace(i, (int) atoms.size()).second)
+                if ((inverseMasses[i] > 0) == isMoving && placeOf.emplace(i, (int) atoms.size()).second)
                     atoms.push_back(i);
         }
         if (isMoving)
@@ -196,45 +178,27 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
     }
     const int numParticles = (int) atoms.size();
 
-    // An order of elimination.
-    vector<vector<int>> rowsOf(numParticles);
-    for (int k = 0; k < numRows; k++)
-        for (int i : rows[k].particles)
-            if (masses[i] > 0)
-                rowsOf[placeOf[i]].push_back(k);
-    std::set<pair<int, int>> coupled;
-    for (const vector<int>& list : rowsOf)
-        for (int a : list)
-            for (int b : list)
-                if (a > b)
-                    coupled.insert({a, b});
-    const EliminationOrder elimination = findEliminationRounds(numRows, MatrixEntries(coupled.begin(), coupled.end()));
-    vector<int> placeOfRow(numRows), levels;
+    // All clusters are eliminated at once, level by level.
+    vector<int> eliminated(numRows), placeOfRow(numRows), levels;
+    std::iota(eliminated.begin(), eliminated.end(), 0);
+    std::stable_sort(eliminated.begin(), eliminated.end(),
+                     [&](int a, int b) { return part.levels[a] < part.levels[b]; });
     for (int place = 0; place < numRows; place++) {
-        placeOfRow[elimination.rows[place]] = place;
-        while ((int) levels.size() <= elimination.levels[place])
+        placeOfRow[eliminated[place]] = place;
+        while ((int) levels.size() <= part.levels[eliminated[place]])
             levels.push_back(place);
     }
+    const int numPartLevels = (int) levels.size();
     levels.push_back(numRows);
 
-    // The columns of L: what the matrix has, and what eliminations fill in.
-    vector<vector<int>> columns(numRows);
-    for (const auto& entry : coupled) {
-        const int a = placeOfRow[entry.first], b = placeOfRow[entry.second];
-        columns[std::min(a, b)].push_back(std::max(a, b));
-    }
-    vector<int> columnStart(1, 0), slotRow, slotColumn;
+    vector<int> columnStart(1, 0), slotRow, slotColumn; // of L
     vector<vector<pair<int, int>>> slotsOf(numRows); // of each row of L: columns and slots
-    for (int k = 0; k < numRows; k++) {
-        vector<int>& column = columns[k];
-        std::sort(column.begin(), column.end());
-        column.erase(std::unique(column.begin(), column.end()), column.end());
-        if (!column.empty())
-            columns[column[0]].insert(columns[column[0]].end(), column.begin() + 1, column.end());
-        for (int row : column) {
-            slotsOf[row].push_back({k, (int) slotRow.size()});
-            slotRow.push_back(row);
-            slotColumn.push_back(k);
+    for (int place = 0; place < numRows; place++) {
+        const int column = eliminated[place];
+        for (const int* row = part.columns.begin(column); row != part.columns.end(column); ++row) {
+            slotsOf[placeOfRow[*row]].push_back({place, (int) slotRow.size()});
+            slotRow.push_back(placeOfRow[*row]);
+            slotColumn.push_back(place);
         }
         columnStart.push_back((int) slotRow.size());
     }
@@ -251,14 +215,14 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
     vector<int> kindOfRow, rowEntry, rowParameter, entryPlaces, order(numRows);
     vector<vector<pair<int, int>>> entriesOf(numParticles); // and their rows
     for (int place = 0; place < numRows; place++) {
-        const Row& row = rows[elimination.rows[place]];
+        const Row& row = rows[eliminated[place]];
         kindOfRow.push_back(row.kind);
         rowParameter.push_back(row.firstParameter);
         rowEntry.push_back((int) entryPlaces.size());
         if (row.expression != NONE)
             rowOfExpression[row.expression] = numConstraints + place;
         for (int i : row.particles) {
-            if (masses[i] > 0)
+            if (inverseMasses[i] > 0)
                 entriesOf[placeOf[i]].push_back({(int) entryPlaces.size(), place});
             entryPlaces.push_back(placeOf[i]);
         }
@@ -302,7 +266,7 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
     table[NumParticles] = numParticles;
     table[NumEntries] = numEntries;
     table[NumSlots] = numSlots;
-    table[NumLevels] = elimination.numLevels;
+    table[NumLevels] = numPartLevels;
     table[NumCoupled] = (int) coupledSlots.size();
     table[FirstRow] = numConstraints;
     table[FirstPlace] = (int) places.size();
@@ -334,7 +298,7 @@ void ExpressionClusters::addPart(const vector<Row>& rows, const vector<int>& fir
     // Vectors and terms, G twice, numbers of the rows, the factors of K and of Newton's matrix; see openPart() in kernels/expression.cc.
     numWork += (16 + NUM_TERMS) * (size_t) numParticles + 6 * (size_t) numEntries + 7 * (size_t) numRows +
                3 * (size_t) numSlots;
-    numLevels = std::max(numLevels, elimination.numLevels);
+    numLevels = std::max(numLevels, numPartLevels);
     numFactorEntries = std::max(numFactorEntries, (size_t) numSlots);
 }
 

@@ -4,8 +4,8 @@
 #ifndef OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 #define OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 
+#include "constraints/ClusterLayout.h"
 #include "expressions/ExpressionDerivatives.h"
-#include "openmm/System.h"
 #include <cstddef>
 #include <map>
 #include <memory>
@@ -29,13 +29,9 @@ public:
     /** There is room for so many numbers of each particle, which are added up over its cluster. */
     static const int NUM_TERMS = 6;
 
-    ExpressionClusters(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
+    ExpressionClusters(const ClusterLayout& layout, const std::vector<ExpressionConstraint>& expressions);
     bool isEmpty() const {
         return parts.empty();
-    }
-    /** Whether each particle moves and is in such a cluster. */
-    const std::vector<char>& getMembers() const {
-        return isMember;
     }
     /** The functions of all expressions (ExpressionCode), and those that choose among them by the kind of a row. */
     std::string writeFunctions() const;
@@ -87,9 +83,9 @@ public:
 
 private:
     struct Row;
-    void addPart(const std::vector<Row>& rows, const std::vector<int>& firstRows, const std::vector<double>& masses);
+    struct Part;
+    void addPart(const Part& part, const std::vector<double>& inverseMasses);
     int kindOf(const ExpressionConstraint& constraint);
-    std::vector<char> isMember;
     std::vector<std::unique_ptr<ExpressionDerivatives>> kinds; // the first is that of distances
     typedef std::pair<std::string, std::vector<std::string>>
         Kind; // the expression, the number of particles, names of parameters

@@ -14,9 +14,9 @@ using std::vector;
 // Of each kernel that has EXPRESSION_PARAMETERS, at the end.
 static const int NUM_PART_ARGUMENTS = 19;
 
-ExpressionSteps::ExpressionSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+ExpressionSteps::ExpressionSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout,
                                  const vector<ExpressionConstraint>& expressions) :
-        context(context), clusters(system, expressions), isMixed(false),
+        context(context), clusters(layout, expressions), isMixed(false),
         numThreads(context.getIsCPU() ? 1 : StepProgram::getGroupSize(true)), cells(3 * clusters.getPlaces().size(), 0),
         place{0, false}, from(0), wereMoving(false), endedPlace(place), numBegun(0), hasMoved(false), numUploads(0) {
     const vector<double>& all = clusters.getParameters();

@@ -28,7 +28,7 @@ public:
         OpenMM::ComputeArray &settings, &partials, &jumpPartials, &failure, &oldPositions, &oldVelocities;
         int firstPartial, numPartials;
     };
-    ExpressionSteps(OpenMM::ComputeContext& context, const OpenMM::System& system,
+    ExpressionSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout,
                     const std::vector<ExpressionConstraint>& expressions);
     const ExpressionClusters& getClusters() const {
         return clusters;

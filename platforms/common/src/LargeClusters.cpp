@@ -4,12 +4,10 @@
 #include "LargeClusters.h"
 #include "constraints/ClusterCut.h"
 #include "constraints/ClusterElimination.h"
-#include "constraints/EliminationOrder.h"
 #include <algorithm>
 #include <cstdint>
 #include <map>
 #include <memory>
-#include <set>
 
 using namespace OpenMMVRattle;
 using std::map;
@@ -54,6 +52,10 @@ const int MANY_JOINTS = 1024, SMALLEST_PIECE = 24;
 const int SPLIT = 8;
 // A cluster of so many pieces is left whole, unless it does not fit into local memory.
 const double WHOLE = 2.5;
+
+bool isLarge(const ClusterKind& kind) {
+    return !kind.isSmall() && !kind.hasExpressions;
+}
 
 int roundUp(size_t value, int unit) {
     return (int) ((value + unit - 1) / unit * unit);
@@ -107,71 +109,40 @@ private:
 
 // The factor of a sparse matrix whose rows are in the order of elimination, outer rows excepted, which are behind.
 struct LargeClusters::Elimination {
+    const FactorColumns& columns;
+    const MatrixEntries outer; // entries between outer rows, sorted
     int size, numOuter, numLevels;
-    vector<int> levels;           // the first place of each level
-    vector<vector<int>> columns;  // the places below the diagonal of each column of L, sorted
-    vector<int> columnStart;      // entries before each column
-    vector<pair<int, int>> outer; // entries between outer rows, by places
-    map<pair<int, int>, int> outerSlots;
+    vector<int> levels; // the first place of each level
 
-    Elimination(const vector<int>& levelOfRow, int numLevels, int numOuter, const MatrixEntries& entries) :
-            size((int) levelOfRow.size()), numOuter(numOuter), numLevels(numLevels) {
+    Elimination(const vector<int>& levelOfRow, int numLevels, const FactorColumns& columns, int numOuter,
+                const MatrixEntries& outer) :
+            columns(columns), outer(outer), size(columns.getNumColumns()), numOuter(numOuter), numLevels(numLevels) {
         for (int place = 0; place < size; place++)
             while ((int) levels.size() <= levelOfRow[place])
                 levels.push_back(place);
         levels.push_back(size);
-        findColumns(entries);
-    }
-    void findColumns(const MatrixEntries& entries) {
-        columns.resize(size);
-        std::set<pair<int, int>> between;
-        for (const auto& entry : entries)
-            if (entry.second < size)
-                columns[entry.second].push_back(entry.first);
-            else
-                between.insert(entry);
-        columnStart.push_back(0);
-        for (int place = 0; place < size; place++) {
-            vector<int>& column = columns[place];
-            std::sort(column.begin(), column.end());
-            column.erase(std::unique(column.begin(), column.end()), column.end());
-            columnStart.push_back(columnStart.back() + (int) column.size());
-            if (column.empty())
-                continue;
-            // What this elimination joins; of inner rows the first one hands it on.
-            const int parent = column[0];
-            if (parent < size)
-                columns[parent].insert(columns[parent].end(), column.begin() + 1, column.end());
-            const auto firstOuter = std::lower_bound(column.begin(), column.end(), size);
-            for (auto a = firstOuter; a != column.end(); ++a)
-                for (auto b = firstOuter; b != a; ++b)
-                    between.insert({*a, *b});
-        }
-        for (const auto& entry : between) {
-            outerSlots[entry] = size + numOuter + columnStart.back() + (int) outer.size();
-            outer.push_back(entry);
-        }
     }
     int getNumRows() const {
         return size + numOuter;
     }
     int getNumEntries() const {
-        return columnStart.back();
+        return (int) columns.rows.size();
     }
     int getFirstOuterSlot() const {
         return getNumRows() + getNumEntries();
     }
     // Where the entry of two places is kept.
     int findSlot(int row, int column) const {
-        if (column >= size)
-            return outerSlots.at({row, column});
-        const vector<int>& list = columns[column];
-        return getNumRows() + columnStart[column] +
-               (int) (std::lower_bound(list.begin(), list.end(), row) - list.begin());
+        if (column < size)
+            return getNumRows() + (int) columns.find(row, column);
+        const auto place = std::lower_bound(outer.begin(), outer.end(), pair<int, int>(row, column));
+        return getFirstOuterSlot() + (int) (place - outer.begin());
     }
     bool isNarrow() const {
-        return std::all_of(columns.begin(), columns.end(),
-                           [](const vector<int>& column) { return column.size() < EliminationOrder::WIDE; });
+        for (int column = 0; column < size; column++)
+            if (columns.getCount(column) >= (size_t) EliminationOrder::WIDE)
+                return false;
+        return true;
     }
 
     // The records of all levels, pass by pass; see applyRecord() in kernels/large.cc. Returns where each level's begin.
@@ -182,8 +153,8 @@ struct LargeClusters::Elimination {
             map<int, vector<int>> entries, right; // for each number the products that are subtracted from it
             Level backward;
             for (int k = levels[level]; k < levels[level + 1]; k++) {
-                const vector<int>& column = columns[k];
-                const int first = getNumRows() + columnStart[k], count = (int) column.size();
+                const int *column = columns.begin(k), *end = columns.end(k);
+                const int first = getNumRows() + (int) columns.start[k], count = (int) (end - column);
                 for (int a = 0; a < count; a++) {
                     auto product = [&](int target, int b) {
                         entries[target].insert(entries[target].end(), {first + a, first + b, k});
@@ -194,9 +165,9 @@ struct LargeClusters::Elimination {
                         product(findSlot(column[a], column[b]), b);
                 }
                 vector<int> record = {k, count, first};
-                record.insert(record.end(), column.begin(), column.begin() + (count > 5 ? 3 : count));
+                record.insert(record.end(), column, count > 5 ? column + 3 : end);
                 if (count > 5)
-                    addMore(record, more, column, 3);
+                    addMore(record, more, column + 3, end);
                 backward.push_back(record);
             }
             passes[0].push_back(makeLevel(entries, 3, 2, 1, more));
@@ -222,11 +193,11 @@ struct LargeClusters::Elimination {
         }
         return starts;
     }
-    static void addMore(vector<int>& record, vector<int>& more, const vector<int>& items, int first) {
+    static void addMore(vector<int>& record, vector<int>& more, const int* begin, const int* end) {
         record.resize(6, 0);
         record.push_back((int) more.size() & 65535);
         record.push_back((int) more.size() >> 16);
-        more.insert(more.end(), items.begin() + first, items.end());
+        more.insert(more.end(), begin, end);
     }
     // Records of numbers to which products of so many factors belong; those with as many products are neighbours.
     static vector<vector<int>> makeLevel(const map<int, vector<int>>& targets, int numFactors, int numWithin,
@@ -243,7 +214,7 @@ struct LargeClusters::Elimination {
             vector<int> record = {target.first, count};
             record.insert(record.end(), factors.begin(), factors.begin() + within * numFactors);
             if (count > numWithin)
-                addMore(record, more, factors, within * numFactors);
+                addMore(record, more, factors.data() + within * numFactors, factors.data() + factors.size());
             level.push_back(record);
         }
         return level;
@@ -260,21 +231,21 @@ struct LargeClusters::Layout {
     int firstContribution;
 };
 
-LargeClusters::LargeClusters(const vector<ClusterKind>& kinds, const Limits& limits) :
+LargeClusters::LargeClusters(const ClusterLayout& layout, const Limits& limits) :
         form(), numThreads(limits.numThreads), narrow(limits.narrow), localMemory(limits.localMemory) {
     size_t total = 0;
-    for (const ClusterKind& kind : kinds)
-        if ((double) kind.pairs.size() > WHOLE * limits.pieceSize)
-            total += kind.pairs.size() * kind.atoms.size();
+    for (const ClusterKind& kind : layout.kinds)
+        if (isLarge(kind) && kind.getNumConstraints() > WHOLE * limits.pieceSize)
+            total += kind.constraints.size();
     int pieceSize = limits.pieceSize;
     if (limits.numResident > 0)
         pieceSize = std::max(pieceSize, (int) (1.1 * (double) total / limits.numResident));
-    build(kinds, limits, pieceSize);
+    build(layout, limits, pieceSize);
     // Smaller pieces may fit into local memory.
     for (int smaller = pieceSize * 3 / 4; isTooLarge() && smaller >= SMALLEST_PIECE; smaller = smaller * 3 / 4)
-        build(kinds, limits, smaller);
+        build(layout, limits, smaller);
     if (isTooLarge() || form.isStaged)
-        build(kinds, limits, pieceSize);
+        build(layout, limits, pieceSize);
     if (form.isInLocalMemory) {
         numFactors = numWork = 0;
         for (Piece& piece : pieces) {
@@ -292,17 +263,17 @@ bool LargeClusters::isTooLarge() const {
     return form.areRecords && !form.isStaged && !form.isInLocalMemory;
 }
 
-void LargeClusters::build(const vector<ClusterKind>& kinds, const Limits& limits, int pieceSize) {
-    clear();
-    form.areRecords = true;
-    bool areRecords = true;
-    for (const ClusterKind& kind : kinds)
-        areRecords = areRecords && addKind(kind, limits, pieceSize);
-    if (!areRecords) {
+void LargeClusters::build(const ClusterLayout& layout, const Limits& limits, int pieceSize) {
+    // Those with most constraints first; returns whether there was a place for all.
+    auto addKinds = [&](bool areRecords, int size) {
         clear();
-        for (const ClusterKind& kind : kinds)
-            addKind(kind, limits, 0);
-    }
+        form.areRecords = areRecords;
+        return std::all_of(layout.kinds.rbegin(), layout.kinds.rend(), [&](const ClusterKind& kind) {
+            return !isLarge(kind) || addKind(layout, kind, limits, size);
+        });
+    };
+    if (!addKinds(true, pieceSize))
+        addKinds(false, 0);
     form.hasJoints = numJoints > 0;
     const auto isJoined = [](const Piece& piece) { return piece.numJoints > 0; };
     form.isStaged =
@@ -326,11 +297,9 @@ void LargeClusters::clear() {
 }
 
 // Returns false if lists of records would be too long for it.
-bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int pieceSize) {
-    const int count = (int) kind.pairs.size();
-    vector<vector<int>> particlesOf;
-    for (const auto& pair : kind.pairs)
-        particlesOf.push_back({pair.first, pair.second});
+bool LargeClusters::addKind(const ClusterLayout& given, const ClusterKind& kind, const Limits& limits, int pieceSize) {
+    const int count = kind.getNumConstraints();
+    const vector<vector<int>>& particlesOf = kind.particlesOf;
     const bool isCut = pieceSize > 0 && count > WHOLE * pieceSize;
     const ClusterElimination cluster(particlesOf,
                                      isCut ? cutClusterAlongTree(particlesOf, pieceSize) : leaveWhole(particlesOf),
@@ -338,7 +307,7 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
     const int numPieceJoints = (int) cluster.joints.size();
     if (numPieceJoints > MANY_JOINTS)
         return false;
-    vector<int> pieceOf(kind.numAtoms), placeOf(kind.numAtoms);
+    vector<int> pieceOf(kind.numParticles), placeOf(kind.numParticles);
     for (size_t p = 0; p < cluster.pieces.size(); p++)
         for (size_t i = 0; i < cluster.pieces[p].particles.size(); i++) {
             pieceOf[cluster.pieces[p].particles[i]] = (int) p;
@@ -354,7 +323,6 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
             couplings; // between rows: the particle's place, twice, + 1 where the signs differ
     };
     vector<Part> parts(cluster.pieces.size());
-    MatrixEntries jointEntries;
     for (size_t p = 0; p < parts.size(); p++) {
         Part& part = parts[p];
         const ClusterElimination::Piece& piece = cluster.pieces[p];
@@ -366,7 +334,6 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
             for (int i : particlesOf[part.constraints[row]])
                 if (pieceOf[i] == (int) p)
                     part.rowsOf[placeOf[i]].push_back((int) row);
-        MatrixEntries entries;
         for (size_t i = 0; i < part.rowsOf.size(); i++)
             for (int a : part.rowsOf[i])
                 for (int b : part.rowsOf[i])
@@ -374,23 +341,18 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
                         const int particle = piece.particles[i];
                         const bool differs = (particlesOf[part.constraints[a]][0] == particle) !=
                                              (particlesOf[part.constraints[b]][0] == particle);
-                        entries.emplace_back(a, b);
                         part.couplings[{a, b}].push_back(2 * (int) i + differs);
                     }
-        part.elimination.reset(new Elimination(piece.levels, piece.numLevels, (int) piece.borders.size(), entries));
+        part.elimination.reset(new Elimination(piece.levels, piece.numLevels, piece.columns, (int) piece.borders.size(),
+                                               piece.borderEntries));
         const Elimination& elimination = *part.elimination;
         if (form.areRecords && (!elimination.isNarrow() ||
                                 elimination.getFirstOuterSlot() + (int) elimination.outer.size() > LARGEST_INDEX - 8))
             return false;
-        for (const auto& entry : elimination.outer)
-            jointEntries.emplace_back(piece.borders[entry.first - elimination.size],
-                                      piece.borders[entry.second - elimination.size]);
     }
-    std::sort(jointEntries.begin(), jointEntries.end());
-    jointEntries.erase(std::unique(jointEntries.begin(), jointEntries.end()), jointEntries.end());
     std::unique_ptr<Elimination> joined;
     if (numPieceJoints > 0)
-        joined.reset(new Elimination(cluster.jointLevels, cluster.numJointLevels, 0, jointEntries));
+        joined.reset(new Elimination(cluster.jointLevels, cluster.numJointLevels, cluster.jointColumns, 0, {}));
     const int numJointEntries = joined == nullptr ? 0 : joined->getNumEntries();
     if (joined != nullptr && (!joined->isNarrow() || numPieceJoints + numJointEntries > LARGEST_INDEX))
         return false;
@@ -461,9 +423,10 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
             vector<int> entryRow, entryColumn, rowStart(1, 0), rowEntry, rowColumn;
             vector<vector<int>> entriesOf(numInner);
             for (int column = 0; column < numInner; column++)
-                for (int row : elimination.columns[column]) {
-                    entriesOf[row].push_back((int) entryRow.size());
-                    entryRow.push_back(row);
+                for (const int* row = elimination.columns.begin(column); row != elimination.columns.end(column);
+                     ++row) {
+                    entriesOf[*row].push_back((int) entryRow.size());
+                    entryRow.push_back(*row);
                     entryColumn.push_back(column);
                 }
             for (const vector<int>& list : entriesOf) {
@@ -474,7 +437,8 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
                 rowStart.push_back((int) rowEntry.size());
             }
             writer.set(LevelStarts, writer.addWords(elimination.levels));
-            writer.set(ColumnStart, writer.addWords(elimination.columnStart));
+            writer.set(ColumnStart,
+                       writer.addWords({elimination.columns.start.begin(), elimination.columns.start.end()}));
             writer.set(EntryRow, writer.addWords(entryRow));
             writer.set(EntryColumn, writer.addWords(entryColumn));
             writer.set(RowStart, writer.addWords(rowStart));
@@ -525,14 +489,15 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
         firstTable.push_back((int) (tables.size() / 4));
         tables.insert(tables.end(), layout.tables.begin(), layout.tables.end());
     }
-    for (size_t c = 0; c < kind.atoms.size(); c++) {
+    for (int c = 0; c < kind.getNumClusters(); c++) {
+        auto lengthOf = [&](int k) { return given.distances[kind.getConstraint(c, k)].length; };
         const int firstJoint = (int) joints.size(), channel = (int) numWords;
         numWords += (size_t) (limits.mixedSize / 4) * (16 * numPieceJoints + numContributions);
         for (int place = 0; place < numPieceJoints; place++) {
             const int k = cluster.joints[place];
-            joints.push_back(
-                {kind.atoms[c][kind.pairs[k].first], kind.atoms[c][kind.pairs[k].second], numConstraints + k, 0});
-            jointLengths.push_back(kind.lengths[c][k]);
+            joints.push_back({kind.getParticle(c, particlesOf[k][0]), kind.getParticle(c, particlesOf[k][1]),
+                              numConstraints + k, 0});
+            jointLengths.push_back(lengthOf(k));
         }
         for (size_t p = 0; p < layouts.size(); p++) {
             const Layout& layout = layouts[p];
@@ -559,15 +524,15 @@ bool LargeClusters::addKind(const ClusterKind& kind, const Limits& limits, int p
             numFactors += layout.factorSize;
             numWork += layout.workSize;
             for (int k : layout.constraints) {
-                const int i = kind.pairs[k].first, j = kind.pairs[k].second;
+                const int i = particlesOf[k][0], j = particlesOf[k][1];
                 const bool isFirst = pieceOf[i] == (int) p, isSecond = pieceOf[j] == (int) p;
                 const int number = numConstraints + k;
-                rows.push_back({kind.atoms[c][i], kind.atoms[c][j], isFirst ? number : number | INT32_MIN,
+                rows.push_back({kind.getParticle(c, i), kind.getParticle(c, j), isFirst ? number : number | INT32_MIN,
                                 (isFirst ? 1 : 0) + (isSecond ? 2 : 0)});
-                rowLengths.push_back(kind.lengths[c][k]);
+                rowLengths.push_back(lengthOf(k));
             }
             for (int i : layout.particles)
-                atoms.push_back(kind.atoms[c][i]);
+                atoms.push_back(kind.getParticle(c, i));
             pieces.push_back(piece);
         }
         numConstraints += count;

@@ -4,7 +4,7 @@
 #ifndef OPENMMVRATTLE_LARGECLUSTERS_H_
 #define OPENMMVRATTLE_LARGECLUSTERS_H_
 
-#include "ClusterKinds.h"
+#include "constraints/ClusterLayout.h"
 #include <cstddef>
 #include <vector>
 
@@ -51,7 +51,7 @@ public:
         int ends; // 1 if the first particle is the piece's own, + 2 if the second is
     };
 
-    LargeClusters(const std::vector<ClusterKind>& kinds, const Limits& limits);
+    LargeClusters(const ClusterLayout& layout, const Limits& limits);
     bool isEmpty() const {
         return pieces.empty();
     }
@@ -124,8 +124,8 @@ public:
 private:
     struct Layout;
     struct Elimination;
-    bool addKind(const ClusterKind& kind, const Limits& limits, int pieceSize);
-    void build(const std::vector<ClusterKind>& kinds, const Limits& limits, int pieceSize);
+    bool addKind(const ClusterLayout& given, const ClusterKind& kind, const Limits& limits, int pieceSize);
+    void build(const ClusterLayout& layout, const Limits& limits, int pieceSize);
     bool isTooLarge() const;
     void clear();
     Form form;

@@ -130,15 +130,26 @@ StepProgram::Update StepProgram::updateOf(const vector<StepMonitor::Term>& terms
     return update == StepDensity::SemiExplicit && StepMonitor::dependOnVelocities(terms) ? SemiExplicit : Sum;
 }
 
-StepProgram::StepProgram(const vector<ClusterKind>& kinds, const LargeClusters& large,
-                         const ExpressionClusters* expressions, int numThreads, const vector<StepMonitor::Term>& terms,
-                         Update update, bool isMixed, bool isWide) : numMonitors((int) terms.size()), update(update) {
+vector<const ClusterKind*> StepProgram::findSmallKinds(const ClusterLayout& layout) {
+    vector<const ClusterKind*> result;
+    for (const ClusterKind& kind : layout.kinds)
+        if (kind.isSmall() && kind.getNumClusters() > 0)
+            result.push_back(&kind);
+    std::stable_sort(result.begin(), result.end(), [](const ClusterKind* a, const ClusterKind* b) {
+        return a->getNumConstraints() > b->getNumConstraints();
+    });
+    return result;
+}
+
+StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large, const ExpressionClusters* expressions,
+                         int numThreads, const vector<StepMonitor::Term>& terms, Update update, bool isMixed,
+                         bool isWide) : numMonitors((int) terms.size()), update(update) {
     const bool areShared = !large.isEmpty() || expressions != nullptr;
     if (areShared)
         defines["NUM_THREADS"] = to_string(numThreads);
     writeMonitors(terms);
     const int bytesOfGroup = getGroupSize(areShared) * (isMixed ? 8 : 4); // for one number of each thread
-    const int numKept = writeClusters(kinds, large.getLocalMemory() / bytesOfGroup);
+    const int numKept = writeClusters(findSmallKinds(layout), large.getLocalMemory() / bytesOfGroup);
     writeLargeClusters(large, numKept * bytesOfGroup);
     words["EXPRESSION_CLUSTERS"] = "";
     if (expressions != nullptr)
@@ -323,22 +334,22 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
 }
 
 // Returns how many numbers of a thread are in local memory, of those for which there is room.
-int StepProgram::writeClusters(const vector<ClusterKind>& kinds, int mostKept) {
+int StepProgram::writeClusters(const vector<const ClusterKind*>& kinds, int mostKept) {
     string functions, finishCases, trialCases, advanceCases;
     numSlots = 0;
     int numAtoms = 0, numLengths = 0, numKept = 0;
     for (size_t i = 0; i < kinds.size(); i++) {
-        const ClusterKind& kind = kinds[i];
-        const int count = (int) kind.atoms.size(), numConstraints = (int) kind.pairs.size();
+        const ClusterKind& kind = *kinds[i];
+        const int count = kind.getNumClusters(), numConstraints = kind.getNumConstraints();
         const string name = "_" + to_string(i);
         places.push_back({numSlots, numAtoms, numLengths});
         string text = numConstraints == 0 ? DeviceSources::particle : DeviceSources::cluster;
         if (numConstraints > 0) {
-            const ClusterAlgebra algebra(kind.pairs);
+            const ClusterAlgebra algebra(kind);
             string first, second;
-            for (const auto& pair : kind.pairs) {
-                first += (first.empty() ? "" : ", ") + to_string(pair.first);
-                second += (second.empty() ? "" : ", ") + to_string(pair.second);
+            for (const vector<int>& pair : kind.particlesOf) {
+                first += (first.empty() ? "" : ", ") + to_string(pair[0]);
+                second += (second.empty() ? "" : ", ") + to_string(pair[1]);
             }
             text.erase(0, text.find("\ninline ") + 1); // the explanation
             replaceAll(text, "CLUSTER_ALGEBRA", algebra.write());
@@ -358,7 +369,7 @@ int StepProgram::writeClusters(const vector<ClusterKind>& kinds, int mostKept) {
                 numKept = std::max(numKept, 4 * numConstraints);
             replaceAll(text, "NUM_ENTRIES", to_string(algebra.getNumEntries()));
         }
-        for (const auto& word : map<string, int>{{"NUM_ATOMS", kind.numAtoms},
+        for (const auto& word : map<string, int>{{"NUM_ATOMS", kind.numParticles},
                                                  {"NUM_CONSTRAINTS", numConstraints},
                                                  {"NUM_CLUSTERS", count},
                                                  {"ATOM_BASE", numAtoms},
@@ -381,7 +392,7 @@ int StepProgram::writeClusters(const vector<ClusterKind>& kinds, int mostKept) {
                         "(c, CLUSTER_ARGUMENTS, kick, drift, tolerance, oldPositions, oldVelocities NOISE_ARGUMENTS)" +
                         tail;
         numSlots = next;
-        numAtoms += count * kind.numAtoms;
+        numAtoms += count * kind.numParticles;
         numLengths += count * numConstraints;
     }
     defines["NUM_KEPT"] = to_string(numKept);

@@ -4,7 +4,6 @@
 #ifndef OPENMMVRATTLE_STEPPROGRAM_H_
 #define OPENMMVRATTLE_STEPPROGRAM_H_
 
-#include "ClusterKinds.h"
 #include "ExpressionClusters.h"
 #include "LargeClusters.h"
 #include "step/AutomaticControl.h"
@@ -93,7 +92,7 @@ public:
     }
 
     /**
-     * @param kinds         the clusters that one thread can have
+     * @param layout        the clusters, of which small ones are for one thread each
      * @param large         those of more distances
      * @param expressions   those with constraints given as expressions, or null
      * @param numThreads    of a group that works on one of the last two
@@ -102,9 +101,10 @@ public:
      * @param isMixed       whether positions and velocities are in double precision
      * @param isWide        whether the device has doubles
      */
-    StepProgram(const std::vector<ClusterKind>& kinds, const LargeClusters& large,
-                const ExpressionClusters* expressions, int numThreads, const std::vector<StepMonitor::Term>& terms,
-                Update update, bool isMixed, bool isWide);
+    StepProgram(const ClusterLayout& layout, const LargeClusters& large, const ExpressionClusters* expressions,
+                int numThreads, const std::vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide);
+    /** The clusters that are small and free particles, in the order of their slots: those with most constraints first. */
+    static std::vector<const ClusterKind*> findSmallKinds(const ClusterLayout& layout);
     /** The threads of a work group. */
     static int getGroupSize(bool hasSharedClusters) {
         return hasSharedClusters ? 128 : 64;
@@ -150,7 +150,7 @@ public:
 
 private:
     void writeMonitors(const std::vector<StepMonitor::Term>& terms);
-    int writeClusters(const std::vector<ClusterKind>& kinds, int mostKept);
+    int writeClusters(const std::vector<const ClusterKind*>& kinds, int mostKept);
     void writeLargeClusters(const LargeClusters& large, int bytesKept);
     void writeAutomaticControl(int numPieces);
     void writeExpressions(const ExpressionClusters& expressions);

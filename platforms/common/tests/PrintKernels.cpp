@@ -23,16 +23,16 @@ int main(int argc, char** argv) {
         return 2;
     }
     const string precision = argv[1], graphs = argv[4];
-    OpenMM::System system;
+    vector<double> masses;
+    vector<DistanceConstraint> distances;
     auto add = [&](const vector<std::pair<int, int>>& pairs) {
-        const int first = system.getNumParticles();
+        const int first = (int) masses.size();
         int numAtoms = 1;
         for (const auto& pair : pairs)
             numAtoms = std::max(numAtoms, std::max(pair.first, pair.second) + 1);
-        for (int i = 0; i < numAtoms; i++)
-            system.addParticle(12);
+        masses.resize(first + numAtoms, 12);
         for (const auto& pair : pairs)
-            system.addConstraint(first + pair.first, first + pair.second, 0.1);
+            distances.push_back({first + pair.first, first + pair.second, 0.1});
     };
     const vector<vector<std::pair<int, int>>> common = {
         {}, {{0, 1}}, {{0, 1}, {0, 2}}, {{0, 1}, {0, 2}, {0, 3}}, {{0, 1}, {0, 2}, {1, 2}}};
@@ -86,13 +86,13 @@ int main(int argc, char** argv) {
                                {0},
                                {}});
     }
+    const ClusterLayout layout(masses, distances, expressions);
     const std::unique_ptr<ExpressionClusters> clusters(
-        expressions.empty() ? nullptr : new ExpressionClusters(system, expressions));
-    const ClusterKinds kinds(system, clusters == nullptr ? vector<char>() : clusters->getMembers());
+        expressions.empty() ? nullptr : new ExpressionClusters(layout, expressions));
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
-    const LargeClusters large(kinds.large,
+    const LargeClusters large(layout,
                               {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
-    const StepProgram program(kinds.small, large, clusters.get(), StepProgram::getGroupSize(true), terms, update,
+    const StepProgram program(layout, large, clusters.get(), StepProgram::getGroupSize(true), terms, update,
                               precision != "single", true);
     for (const auto& define : program.getDefines())
         std::cout << "#define " << define.first << " " << define.second << "\n";

@@ -153,6 +153,9 @@ struct Molecules {
         constraint.parameters["held"] = value[0];
         expressions.push_back(constraint);
     }
+    ClusterLayout findLayout() const {
+        return ClusterLayout(masses, constraints, expressions);
+    }
     void addConstraint(int i, int j) {
         const Vec3 r = positions[i] - positions[j];
         system.addConstraint(i, j, std::sqrt(r.dot(r)));
@@ -174,8 +177,8 @@ struct Both {
     Both(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
             dynamics(molecules.masses, molecules.constraints, molecules.expressions),
-            device(lender.getDevice(), molecules.system, molecules.expressions), expressions(molecules.expressions),
-            settings() {
+            device(lender.getDevice(), dynamics.getConstraintSystem().getLayout(), molecules.expressions),
+            expressions(molecules.expressions), settings() {
     }
     void move(int expression, const std::string& name, double change) {
         std::map<std::string, double>& parameters = expressions[expression].parameters;
@@ -509,8 +512,8 @@ void testDiamond() {
 void testDivision() {
     const Molecules molecules = makeMolecules({makeProtein(60), makeChain(130), makeChain(1500)});
     LargeClusters::Limits limits = {128, 40 * 1024, 132, 32, 8, 4, 792, 64};
-    const ClusterKinds kinds(molecules.system);
-    const LargeClusters waiting(kinds.large, limits);
+    const ClusterLayout layout = molecules.findLayout();
+    const LargeClusters waiting(layout, limits);
     ASSERT(waiting.getForm().areRecords && waiting.getForm().isInLocalMemory && waiting.getForm().hasJoints);
     ASSERT(!waiting.getForm().isStaged);
     ASSERT(waiting.getNumLevels() <= 9);
@@ -528,22 +531,22 @@ void testDivision() {
     for (const LargeClusters::Row& row : waiting.getRows())
         ASSERT(owners[row.atom1] == 1 && owners[row.atom2] == 1);
     limits.numResident = 0;
-    const LargeClusters staged(kinds.large, limits);
+    const LargeClusters staged(layout, limits);
     ASSERT(staged.getForm().isStaged && !staged.getForm().isInLocalMemory && staged.getForm().areRecords);
     // Little memory gets smaller pieces.
     limits.numResident = 132;
     limits.localMemory = 20 * 1024;
-    const LargeClusters little(kinds.large, limits);
+    const LargeClusters little(layout, limits);
     ASSERT(little.getForm().isInLocalMemory && 16 * little.getLocalSize() <= limits.localMemory);
     ASSERT(little.getPieces().size() > waiting.getPieces().size());
     // Few processors get larger pieces.
     limits.localMemory = 40 * 1024;
     limits.numResident = 14;
-    const LargeClusters few(kinds.large, limits);
+    const LargeClusters few(layout, limits);
     ASSERT(!few.getForm().isStaged && few.getPieces().size() <= 15);
     // What is dense is left whole.
     const Molecules star = makeMolecules({makeStar(60, 1)});
-    const LargeClusters dense(ClusterKinds(star.system).large, limits);
+    const LargeClusters dense(star.findLayout(), limits);
     ASSERT(!dense.getForm().areRecords && !dense.getForm().hasJoints && !dense.getForm().isInLocalMemory);
 }
 
@@ -581,27 +584,24 @@ void testDivisionOfExpressions() {
     ASSERT_EQUAL(1, clusters.getParts().size()); // of 89 constraints
     // A ladder: sections of two particles that a distance joins, each joined to the next by two expressions. As a chain it halves in
     // each round, of up to three constraints that are coupled.
-    System ladder;
+    vector<DistanceConstraint> ladder;
     vector<ExpressionConstraint> rungs;
     const int length = 1000;
     for (int i = 0; i < length; i++) {
-        ladder.addParticle(1);
-        ladder.addParticle(1);
-        ladder.addConstraint(2 * i, 2 * i + 1, 0.1);
+        ladder.push_back({2 * i, 2 * i + 1, 0.1});
         for (int k = 0; k < (i > 0 ? 2 : 0); k++)
             rungs.push_back({"x1-x2-z3*y4+shift", {2 * i - 2, 2 * i - 1, 2 * i, 2 * i + 1}, {{"shift", 0.1 * k}}});
     }
-    const ExpressionClusters chain(ladder, rungs);
+    const ExpressionClusters chain(ClusterLayout(vector<double>(2 * length, 1.0), ladder, rungs), rungs);
     ASSERT_EQUAL(1, chain.getParts().size());
     ASSERT_EQUAL(3 * length - 2, chain.getNumConstraints());
     ASSERT(chain.getNumLevels() <= 60);
     ASSERT(chain.getNumFactorEntries() <= (size_t) 40 * length);
     // Small clusters share a work group.
-    System pendulums;
     vector<ExpressionConstraint> spheres;
     for (int i = 0; i < 1000; i++)
-        spheres.push_back({"x1^2+y1^2+z1^2-1", {pendulums.addParticle(1)}, {}});
-    const ExpressionClusters many(pendulums, spheres);
+        spheres.push_back({"x1^2+y1^2+z1^2-1", {i}, {}});
+    const ExpressionClusters many(ClusterLayout(vector<double>(1000, 1.0), {}, spheres), spheres);
     ASSERT_EQUAL(8, many.getParts().size());
     ASSERT_EQUAL(1, many.getNumLevels());
 }
@@ -784,11 +784,13 @@ void testDependentConstraints(const std::string& precision) {
     for (int k : {398, 399}) {
         const Vec3 r = molecules.positions[first + k] - molecules.positions[first + k + 1];
         const int constraint = molecules.system.getNumConstraints() - 401 + k;
+        molecules.constraints[constraint].length = std::sqrt(r.dot(r));
         molecules.system.setConstraintParameters(constraint, first + k, first + k + 1, std::sqrt(r.dot(r)));
     }
     Lender lender;
     Context context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}});
-    DeviceSteps device(lender.getDevice(), molecules.system);
+    const ClusterLayout layout = molecules.findLayout();
+    DeviceSteps device(lender.getDevice(), layout);
     device.setSettings({0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-6, {}});
     context.setPositions(molecules.positions);
     context.setVelocities(molecules.velocities);
@@ -1142,7 +1144,7 @@ struct BothLangevin {
     BothLangevin(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
             dynamics(molecules.masses, molecules.constraints, molecules.expressions),
-            device(lender.getDevice(), molecules.system, molecules.expressions),
+            device(lender.getDevice(), dynamics.getConstraintSystem().getLayout(), molecules.expressions),
             tolerance(DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12)) {
         LangevinSettings langevin;
         langevin.temperature = 300;
