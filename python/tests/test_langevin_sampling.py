@@ -144,7 +144,8 @@ def test_temperature_of_rigid_water(step: float, friction: float) -> None:
     mean, error = blocks(by_hand)
     print(f"of the velocities {mean:.1f} +- {error:.1f}")
     assert step == 0.002 or mean + 4 * error < 299.5
-    assert integrator.getNumSubstepped() <= 3
+    # An encounter takes up to some ten steps, and one in 60,000 steps is no surprise with eight waters in a trap.
+    assert integrator.getNumSubstepped() <= 30
 
 
 @pytest.mark.parametrize("samples", [2500, pytest.param(20000, marks=pytest.mark.claims)])

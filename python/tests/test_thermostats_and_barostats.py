@@ -86,9 +86,9 @@ def test_temperature_holds(update: str) -> None:
     means = [float(np.mean(temperatures[i * each : (i + 1) * each])) for i in range(blocks)]
     error = float(np.std(means)) / np.sqrt(blocks - 1)
     print(f"{update}: {time_of(context):.0f} ps, temperature {mean:.1f} K, standard error {error:.1f} K")
-    # 100 ps, 0.1 ps apart, of 48 freedoms: a standard error of 61 K/sqrt(1000) = 2 K. Four of them.
-    assert error < 4
-    assert mean == pytest.approx(300, abs=8)
+    # 61 K among samples of 48 freedoms, some 500 of them independent: a standard error near 3 K, known to a sixth.
+    assert error < 6
+    assert abs(mean - 300) < 4 * error
     # Fluctuations as in the canonical ensemble: variance of T is 2/48 T^2.
     assert np.std(temperatures) == pytest.approx(300 * np.sqrt(2 / 48), rel=0.15)
     assert integrator.getNumForceEvaluations() == 5001 + blocks * each * 5
