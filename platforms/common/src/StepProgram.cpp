@@ -171,6 +171,7 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
                                       {"LANGEVIN", Langevin},
                                       {"UPDATE", update},
                                       {"HALF_SUMS", update == SemiExplicit ? 1 : 0},
+                                      {"NUM_DRIFTS", update == Langevin ? 2 : 1},
                                       {"NUM_MONITORS", (int) terms.size()},
                                       {"NUM_VALUES", std::max(1, (int) terms.size())},
                                       {"NUM_SUMS", numSums},
@@ -363,7 +364,6 @@ int StepProgram::writeClusters(const vector<const ClusterKind*>& kinds, int most
             replaceAll(text, "MAKE_VECTORS",
                        isInLocalMemory ? "VECTORS r = kept + LOCAL_ID;" : "mixed r[4*NUM_CONSTRAINTS];");
             replaceAll(text, "VECTORS", isInLocalMemory ? "LOCAL_ARG volatile mixed*" : "mixed*");
-            replaceAll(text, "LEAVES_MIDDLE", isInLocalMemory ? "true" : "false");
             replaceAll(text, "STRIDE", isInLocalMemory ? "GROUP_SIZE" : "1");
             if (isInLocalMemory)
                 numKept = std::max(numKept, 4 * numConstraints);

@@ -3,8 +3,7 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, 4 for Langevin dynamics), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other, and but for Langevin dynamics a short
-// one), "dense" (many bonds on one particle), "expressions" (angles, and all functions), or "rare" with the number of a graph of up to
+// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other, and a short one), "dense" (many bonds on one particle), "expressions" (angles, and all functions), or "rare" with the number of a graph of up to
 // eight constraints, for that alone.
 
 #include "StepProgram.h"
@@ -65,7 +64,7 @@ int main(int argc, char** argv) {
         add(bonds);
     const int updateNumber = std::stoi(argv[3]);
     const bool isAutomatic = updateNumber == 3, isLangevin = updateNumber == 4;
-    if (graphs == "large" && !isLangevin)
+    if (graphs == "large")
         add(rare[5]); // whose vectors share the memory of pieces
     vector<StepMonitor::Term> terms;
     if (!isAutomatic)

@@ -188,22 +188,27 @@ void testClash() {
 void testSubstepsInBetween() {
     Waters t(27);
     t.system.addForce(new CMMotionRemover(1)); // what it does before steps that are taken again is done again
-    Run there(t, reference()), here(t, getTestPlatform());
+    Run there(t, reference()), here(t, getTestPlatform()), oneByOne(t, getTestPlatform());
     there.begin(t);
     there.integrator.step(20);
     const std::string xml = there.save();
-    for (Run* each : {&there, &here})
+    for (Run* each : {&there, &here, &oneByOne})
         each->load(xml);
     const double u = there.integrator.getMonitorValue();
-    for (Run* each : {&there, &here})
+    for (Run* each : {&there, &here, &oneByOne})
         each->integrator.setReferenceMonitorValue(u / 3.26);
     for (int steps : {1, 30}) {
         for (Run* each : {&there, &here})
             each->integrator.step(steps);
+        for (int i = 0; i < steps; i++)
+            oneByOne.integrator.step(1);
         ASSERT_EQUAL(there.integrator.getNumSubstepped(), here.integrator.getNumSubstepped());
         ASSERT_EQUAL(there.context.getStepCount(), here.context.getStepCount());
         ASSERT_EQUAL_TOL(there.context.getTime(), here.context.getTime(), 1e-6);
         ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-6, 1e-3, 1e-1));
+        // Whether many steps are asked for at once makes no difference but rounding.
+        ASSERT_EQUAL(here.integrator.getNumSubstepped(), oneByOne.integrator.getNumSubstepped());
+        ASSERT(largestDifference(here.positions(), oneByOne.positions()) <= choose(1e-10, 1e-3, 1e-1));
     }
     ASSERT(here.integrator.getNumSubstepped() > 5);
     ASSERT(here.integrator.getNumSubstepped() < 45);

@@ -18,38 +18,36 @@ from pathlib import Path
 
 CONSTRAINT_AND_APPLIED_FORCE, MULTIPLIER_P_NORM = 3, 4
 SEMI_EXPLICIT, EXPLICIT, AUTOMATIC, LANGEVIN = 0, 1, 3, 4
-# Precision, monitor, update, graphs, architectures. The program for SemiExplicit has every kernel, and the largest.
+ARCHITECTURES = ("sm_70", "sm_90")
+# Precision, monitor, update, graphs. The program for SemiExplicit has every kernel, and the largest.
 CASES = (
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
-    ("single", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common", ("sm_70", "sm_90")),
-    ("double", MULTIPLIER_P_NORM, SEMI_EXPLICIT, "common", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_70", "sm_90")),
-    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "large", ("sm_70", "sm_90")),
-    ("double", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "dense", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_70", "sm_90")),
-    ("single", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common", ("sm_90",)),
-    ("double", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "large", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "common", ("sm_70", "sm_90")),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "large", ("sm_70", "sm_90")),
-    ("double", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "dense", ("sm_90",)),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common"),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "common"),
+    ("double", MULTIPLIER_P_NORM, SEMI_EXPLICIT, "common"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large"),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "large"),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "large"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "dense"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common"),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "common"),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "large"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "common"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "large"),
+    ("double", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "dense"),
     *(
-        (precision, CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, kind, ("sm_90",))
-        for precision, kind in (
-            ("mixed", "rare5"),
-            ("mixed", "rare10"),
-            ("double", "rare8"),
-            ("double", "rare9"),
-            ("double", "rare10"),
-            ("double", "rare11"),
+        (precision, CONSTRAINT_AND_APPLIED_FORCE, update, f"rare{graph}")
+        for precision, update, graphs in (
+            ("mixed", SEMI_EXPLICIT, (5, 10)),
+            ("double", SEMI_EXPLICIT, (8, 9, 10, 11)),
+            ("mixed", AUTOMATIC, (7, 10)),
+            ("mixed", LANGEVIN, (3, 8, 10)),
         )
+        for graph in graphs
     ),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "rare10", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "rare5", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "expressions", ("sm_70", "sm_90")),
-    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "expressions", ("sm_90",)),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "expressions", ("sm_70", "sm_90")),
-    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "expressions", ("sm_70", "sm_90")),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, SEMI_EXPLICIT, "expressions"),
+    ("single", CONSTRAINT_AND_APPLIED_FORCE, EXPLICIT, "expressions"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, AUTOMATIC, "expressions"),
+    ("mixed", CONSTRAINT_AND_APPLIED_FORCE, LANGEVIN, "expressions"),
 )
 
 # What OpenMM's own text at the beginning of every program defines, as far as ours needs it.
@@ -117,12 +115,12 @@ def main(print_kernels: str) -> int:
         return 77
     nvrtc = ctypes.CDLL(str(library))
     num_failed = 0
-    for precision, monitor, update, graphs, architectures in CASES:
+    for precision, monitor, update, graphs in CASES:
         text = subprocess.run(
             [print_kernels, precision, str(monitor), str(update), graphs], check=True, capture_output=True, text=True
         ).stdout
         defines = "".join(f"#define {name} {value}\n" for name, value in TYPES[precision].items())
-        for architecture in architectures:
+        for architecture in ARCHITECTURES:
             report = compile_text(nvrtc, defines + PRELUDE + text, architecture)
             kernels = re.findall(
                 r"properties for (\w+)\n\D*(\d+) bytes stack frame, (\d+) bytes spill stores.*\n.*Used (\d+) registers",

@@ -40,30 +40,29 @@ inline DEVICE void loadVectors_KIND(int c, GLOBAL const int* RESTRICT atoms, GLO
 inline DEVICE void measure_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mm_long* force, VECTORS r, mixed* L, mixed (*v)[3], mixed* w,
         mixed* lambda, mixed* sums) {
     const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed rightSide[NUM_CONSTRAINTS];
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         mixed u[3];
         UNROLL for (int d = 0; d < 3; d++)
             u[d] = v[first[k]][d] - v[second[k]][d];
-        rightSide[k] = dot3(u, u);
+        lambda[k] = dot3(u, u);
     }
     mixed forceSquared = 1;
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         mixed a[3];
-        forceSquared = loadAcceleration(AGAIN(NUM_CONSTRAINTS > 5 && forceSquared > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], a);
+        forceSquared = loadAcceleration(AGAIN(NUM_CONSTRAINTS > 4 && forceSquared > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], w[i], a);
         addParticleTerms(sums, forceSquared, w[i], v[i]);
         UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
             if (first[k] == i)
-                rightSide[k] += dotVector_KIND(r, k, a);
+                lambda[k] += dotVector_KIND(r, k, a);
             if (second[k] == i)
-                rightSide[k] -= dotVector_KIND(r, k, a);
+                lambda[k] -= dotVector_KIND(r, k, a);
         }
     }
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-        lambda[k] = rightSide[k];
+        r[(3*NUM_CONSTRAINTS + k)*STRIDE] = lambda[k];
     solve_KIND(L, lambda);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-        addConstraintTerms(sums, lambda[k], rightSide[k]);
+        addConstraintTerms(sums, lambda[k], r[(3*NUM_CONSTRAINTS + k)*STRIDE]);
 }
 
 /** v += factor M^-1 G^T x */
@@ -89,7 +88,20 @@ inline DEVICE mixed loadNetAcceleration_KIND(int i, GLOBAL const mm_long* force,
 }
 
 // Registers are what clusters of many constraints lack. So what is needed again after a solution is read AGAIN and not kept, and those of
-// six and more constraints, in which that saves nothing else, read one particle after the other and not all at once.
+// five and more constraints, in which that saves nothing else, read one particle after the other and not all at once.
+
+/** The velocities after a kick for that time. */
+inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed kick, mixed* w, mixed (*v)[3]) {
+    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
+        const bool isReady = (NUM_CONSTRAINTS > 4 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
+        mixed a[3];
+        w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
+        loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
+        UNROLL for (int d = 0; d < 3; d++)
+            v[i][d] += kick*a[d];
+    }
+}
 
 /** (3.12)-(3.13) and Lambda; returns false if the constraints depend on each other or a force is no number. */
 inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, bool formHalf, bool isStored, mixed* sums, mixed* halfSums LAST_STATE_PARAMETER) {
@@ -101,7 +113,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         mixed a[3];
-        const bool isReady = (NUM_CONSTRAINTS > 5 && (i == 0 ? (mixed) r[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        const bool isReady = (NUM_CONSTRAINTS > 4 && (i == 0 ? (mixed) r[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         isRegular = loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a) >= 0 && isRegular;
         UNROLL for (int d = 0; d < 3; d++)
@@ -122,12 +134,15 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     push_KIND(r, w, x1, -1, v);
     const bool isPushed = x1[0] > 0;
     measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isPushed, force), r, L, v, w, x1, sums);
-    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+    UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = x1[k];
+        if (NUM_ENTRIES > 30)
+            r[(3*NUM_CONSTRAINTS + k)*STRIDE] = x1[k];
+    }
 #if CLUSTER_SUMS
     mixed net[3] = {x1[0], 0, 0}, share = 0;
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-        loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], r, w[i], x1, net);
+        loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 5 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c], r, w[i], x1, net);
         share += shareOf(dot3(net, net), w[i], v[i]);
     }
     isRegular = addCluster(sums, share) && isRegular;
@@ -136,9 +151,9 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     mixed net[3] = {x1[0], 0, 0}, terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        const mixed4 before = AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, velm)[atom];
+        const mixed4 before = AGAIN((NUM_CONSTRAINTS < 5 ? x1[0] : net[0]) > 0, velm)[atom];
         followForce(terms, last, force, paddedNumAtoms, atom, w[i], before.x, before.y, before.z);
-        addFlight(terms, loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 6 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atom, r, w[i], x1, net), v[i]);
+        addFlight(terms, loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 5 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atom, r, w[i], x1, net), v[i]);
         addAutomaticTerms(terms, last, atom, w[i], v[i], net);
     }
     addCluster(sums, terms, last, atoms[ATOM_BASE + c]);
@@ -148,7 +163,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
 #if HALF_SUMS
         mixed before[3], a[3];
-        const bool isReady = ((i == 0 || NUM_CONSTRAINTS < 6 ? x1[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
+        const bool isReady = ((i == 0 || NUM_CONSTRAINTS < 5 ? x1[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         loadVelocity(AGAIN(isReady, velm), atom, before);
         loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
 #endif
@@ -160,23 +175,15 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 #endif
     }
 #if HALF_SUMS
+    if (NUM_ENTRIES > 30) { // made and read again, since registers do not suffice for keeping them
+        factorize_KIND(r, w, L);
+        UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
+            x1[k] = r[(3*NUM_CONSTRAINTS + k)*STRIDE];
+    }
     push_KIND(r, w, x1, formHalf ? halfKick : (mixed) 0, v);
     measure_KIND(c, paddedNumAtoms, atoms, AGAIN(v[0][0] > 0, force), r, L, v, w, x1, halfSums);
 #endif
     return isRegular;
-}
-
-/** The velocities after a kick for that time. */
-inline DEVICE void loadKicked_KIND(int c, int paddedNumAtoms, GLOBAL const int* RESTRICT atoms, GLOBAL const mixed4* velm, GLOBAL const mm_long* force, mixed kick, mixed* w, mixed (*v)[3]) {
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        const bool isReady = (NUM_CONSTRAINTS > 5 && i > 0 && v[i == 0 ? 0 : i - 1][0] > 0);
-        mixed a[3];
-        w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
-        loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a);
-        UNROLL for (int d = 0; d < 3; d++)
-            v[i][d] += kick*a[d];
-    }
 }
 
 /**
@@ -229,7 +236,7 @@ inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed
     MAKE_VECTORS
     mixed v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], gamma[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0] > 0);
+    const bool isLoaded = (NUM_CONSTRAINTS > 4 && r[0] > 0);
     loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), dt/2, w, v);
     const int iterations = constrain_KIND(c, dt/2, dt, tolerance, lengths, multipliers, r, w, v, gamma);
     if (iterations >= 0) // where the next trial starts
@@ -243,8 +250,8 @@ inline DEVICE bool try_KIND(CLUSTER_PARAMETERS, mixed dt, mixed tolerance, mixed
 }
 
 /**
- * A kick and a drift (3.9)-(3.11), for these times; in Langevin dynamics noise follows, and the drift once more. Returns the number of
- * iterations, or -1 if they do not converge.
+ * A kick and a drift (3.9)-(3.11), for these times; in Langevin dynamics noise follows, and the drift once more, from where the first
+ * has left the state. Returns the number of iterations, or -1 if they do not converge.
  */
 inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed tolerance, GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities NOISE_PARAMETERS) {
     MAKE_VECTORS
@@ -256,53 +263,42 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed t
         oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
         oldVelocities[atom] = velm[atom];
     }
-    loadVectors_KIND(c, atoms, posq, posqCorrection, r);
-    const bool isLoaded = (NUM_CONSTRAINTS > 5 && r[0] > 0);
-    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), kick, w, v);
-    int iterations = constrain_KIND(c, kick, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+    int iterations = 0;
+    KEEP_LOOP for (int drift = 0; drift < NUM_DRIFTS; drift++) {
+        const mixed kickNow = (drift == 0 ? kick : (mixed) 0);
+        // Kept through both drifts in mixed precision they would be too much for eight bonds on one particle.
+        GLOBAL const int* RESTRICT particles = AGAIN(NUM_ENTRIES > 30 && sizeof(real) < sizeof(mixed) && iterations > 0, atoms);
+        loadVectors_KIND(c, particles, posq, posqCorrection, r);
+        const bool isLoaded = (NUM_CONSTRAINTS > 4 && r[0] > 0);
+        loadKicked_KIND(c, paddedNumAtoms, particles, AGAIN(isLoaded, velm), AGAIN(isLoaded, force), kickNow, w, v);
+        const int more = constrain_KIND(c, kickNow, dt, tolerance, lengths, multipliers, r, w, v, gamma);
+        iterations = (iterations >= 0 && more >= 0 ? iterations + more : -1);
+        if (more >= 0) {
+            loadKicked_KIND(c, paddedNumAtoms, particles, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), kickNow, w, v);
+            push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
 #if UPDATE == LANGEVIN
-    const int first[] = FIRST_ATOMS, second[] = SECOND_ATOMS;
-    mixed middle[NUM_ATOMS][3];
-    loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), kick, w, v);
-    push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
-    UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-        const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        const bool isReady = (v[NUM_CONSTRAINTS < 6 || i == 0 ? 0 : i - 1][0] > 0);
-        const real charge = loadPosition(AGAIN(isReady, posq), AGAIN(isReady, posqCorrection), atom, middle[i]);
-        UNROLL for (int d = 0; d < 3; d++)
-            middle[i][d] += dt*v[i][d];
-        if (LEAVES_MIDDLE)
-            storePosition(posq, posqCorrection, atom, middle[i][0], middle[i][1], middle[i][2], charge);
-        addNoise(noise, AGAIN(isReady, atomIndex)[atom], w[i], v[i]);
-        if (LEAVES_MIDDLE)
-            velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
-    }
-    if (LEAVES_MIDDLE)
-        loadVectors_KIND(c, atoms, AGAIN(v[NUM_ATOMS - 1][0] > 0, posq), AGAIN(v[NUM_ATOMS - 1][0] > 0, posqCorrection), r);
-    else
-        UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++)
-            UNROLL for (int d = 0; d < 3; d++)
-                r[(3*k + d)*STRIDE] = middle[first[k]][d] - middle[second[k]][d];
-    const int more = constrain_KIND(c, 0, dt, tolerance, lengths, multipliers, r, w, v, gamma);
-    iterations = (iterations >= 0 && more >= 0 ? iterations + more : -1);
-    UNROLL for (int i = 0; i < (LEAVES_MIDDLE ? NUM_ATOMS : 0); i++)
-        loadVelocity(AGAIN(gamma[0] > 0, velm), atoms[ATOM_BASE + i*NUM_CLUSTERS + c], v[i]);
+            const Noise noise = makeNoise(step, AGAIN(v[0][0] > 0, noiseState), AGAIN(v[0][0] > 0, settings));
 #endif
-    if (iterations >= 0) {
-#if UPDATE != LANGEVIN
-        loadKicked_KIND(c, paddedNumAtoms, atoms, AGAIN(gamma[0] > 0, velm), AGAIN(gamma[0] > 0, force), kick, w, v);
-#endif
-        push_KIND(r, w, gamma, dt > 0 ? 1/dt : (mixed) 0, v);
-        UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
-            const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-            mixed x[3];
-            const real charge = loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, x);
+            UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
+                const int atom = particles[ATOM_BASE + i*NUM_CLUSTERS + c];
+                mixed x[3];
+                const real charge = loadPosition(AGAIN(v[0][0] > 0, posq), AGAIN(v[0][0] > 0, posqCorrection), atom, x);
+                storePosition(posq, posqCorrection, atom, x[0] + dt*v[i][0], x[1] + dt*v[i][1], x[2] + dt*v[i][2], charge);
 #if UPDATE == LANGEVIN
-            UNROLL for (int d = 0; d < 3; d++)
-                x[d] = (LEAVES_MIDDLE ? x[d] : middle[i][d]);
+                if (drift == 0 && NUM_CONSTRAINTS < 5)
+                    addNoise(noise, atomIndex[atom], w[i], v[i]);
 #endif
-            storePosition(posq, posqCorrection, atom, x[0] + dt*v[i][0], x[1] + dt*v[i][1], x[2] + dt*v[i][2], charge);
-            velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
+                velm[atom] = make_mixed4(v[i][0], v[i][1], v[i][2], w[i]);
+            }
+#if UPDATE == LANGEVIN
+            KEEP_LOOP for (int i = 0; i < (drift == 0 && NUM_CONSTRAINTS > 4 ? NUM_ATOMS : 0); i++) {
+                const int atom = particles[ATOM_BASE + i*NUM_CLUSTERS + c];
+                mixed u[3];
+                const mixed inverseMass = loadVelocity(velm, atom, u);
+                addNoise(noise, atomIndex[atom], inverseMass, u);
+                velm[atom] = make_mixed4(u[0], u[1], u[2], inverseMass);
+            }
+#endif
         }
     }
     return iterations;

@@ -10,21 +10,16 @@ typedef struct {
     mixed damping, size;
 } Noise;
 
-#define NOISE_PARAMETERS , Noise noise, GLOBAL const int* RESTRICT atomIndex
-#define NOISE_ARGUMENTS , noise, atomIndex
-#define NO_NOISE , noNoise(), 0
+#define NOISE_PARAMETERS , int step, GLOBAL const wide* RESTRICT settings, GLOBAL const int* RESTRICT noiseState, GLOBAL const int* RESTRICT atomIndex
+#define NOISE_ARGUMENTS , step, settings, noiseState, atomIndex
+#define NO_NOISE , 0, 0, 0, 0
 #define NOISE_STATE , GLOBAL const int* RESTRICT noiseState, GLOBAL const int* RESTRICT atomIndex
 #define LARGE_NOISE_STATE , GLOBAL const wide* RESTRICT settings NOISE_STATE
 
-inline DEVICE Noise noNoise() {
-    Noise noise;
-    noise.seed[0] = noise.seed[1] = noise.step[0] = noise.step[1] = 0;
-    noise.damping = 1;
-    noise.size = 0;
-    return noise;
-}
-
-/** noiseState is the seed, the number of a step among those that have drawn noise, and its number here. */
+/**
+ * noiseState is the seed, the number of a step among those that have drawn noise, and its number here. Made where it is used: loading it costs
+ * nothing, keeping it registers.
+ */
 inline DEVICE Noise makeNoise(int step, GLOBAL const int* RESTRICT noiseState, GLOBAL const wide* RESTRICT settings) {
     Noise noise;
     noise.seed[0] = (word_t) noiseState[0];

@@ -700,7 +700,7 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     before[3*i+d] += v[d];
                     v[d] *= inverse;
                 }
-                addNoise(noise, atomIndex[pieceAtoms[firstAtom+i]], w, v);
+                addNoise(makeNoise(step, noiseState, settings), atomIndex[pieceAtoms[firstAtom+i]], w, v);
                 UNROLL for (int d = 0; d < 3; d++)
                     v[d] *= task.dt;
             }
@@ -946,9 +946,6 @@ KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int
     const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
     const mixed dt = (mixed) nextControl[STEP_SIZE];
     const LargeTask task = makeTask(step, firstStage, endStage, stamp, dt/2, UPDATE == LANGEVIN ? dt/2 : dt, tolerance);
-#if UPDATE == LANGEVIN
-    const Noise noise = makeNoise(step, noiseState, settings);
-#endif
     advancePieces(isFrozen ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags NOISE_ARGUMENTS);
 }
 

@@ -57,7 +57,7 @@ inline DEVICE int advance_KIND(CLUSTER_PARAMETERS, mixed kick, mixed dt, mixed t
 #if UPDATE == LANGEVIN
     UNROLL for (int d = 0; d < 3; d++)
         x[d] += dt*v[d];
-    addNoise(noise, atomIndex[atom], inverseMass, v);
+    addNoise(makeNoise(step, noiseState, settings), atomIndex[atom], inverseMass, v);
 #endif
     storePosition(posq, posqCorrection, atom, x[0] + dt*v[0], x[1] + dt*v[1], x[2] + dt*v[2], charge);
     velm[atom] = make_mixed4(v[0], v[1], v[2], inverseMass);

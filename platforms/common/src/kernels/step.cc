@@ -8,6 +8,8 @@
 // velocities; `wide` is double where the device has it.
 
 #define UNROLL _Pragma("unroll")
+// Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
+#define KEEP_LOOP _Pragma("unroll 1")
 
 typedef WIDE wide;
 typedef unsigned int word_t;
@@ -293,9 +295,6 @@ inline DEVICE void addInGroup(mixed* numbers, const int count, LOCAL_ARG mixed* 
 #endif
 #endif
 
-// Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
-#define KEEP_LOOP _Pragma("unroll 1")
-
 LARGE_CLUSTERS
 
 EXPRESSION_CLUSTERS
@@ -578,9 +577,6 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
     }
     SYNC_THREADS;
     const mixed dt = (mixed) shared[0], kick = dt/2, drift = (UPDATE == LANGEVIN ? dt/2 : dt);
-#if UPDATE == LANGEVIN
-    const Noise noise = makeNoise(step, noiseState, settings);
-#endif
 #if IS_FUSED
     if (GROUP_ID < NUM_FUSED) {
         const LargeTask task = makeTask(step, 0, MAX_STAGES, stamp, kick, drift, tolerance);
