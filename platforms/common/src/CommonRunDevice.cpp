@@ -289,11 +289,16 @@ template <class Host> void CommonRunDevice<Host>::settle() {
         stepsUntilLook = report.hasFailed ? 1 : std::min(2 * stepsUntilLook, MANY_STEPS);
         if (!report.hasFailed || hasChangeFailed)
             break;
-        // The step that failed is left to the host, which has other means, and says what is wrong if they fail too.
+        // The step that failed is left to the host, which has other means, and says what is wrong if they fail too; unless the device can
+        // do more from now on.
         context.computeVirtualSites();
-        takeToHost();
-        Host::step(lastMaxTime);
-        hasStepped = false;
+        if (report.isForNewton && steps->prepareNewton())
+            step(lastMaxTime);
+        else {
+            takeToHost();
+            Host::step(lastMaxTime);
+            hasStepped = false;
+        }
         for (int i = report.numSteps + 1; i < asked; i++) {
             repeatActions();
             step(NO_LIMIT);

@@ -121,8 +121,8 @@ void DeviceSteps::initialize() {
     oldVelocities.initialize(context, context.getPaddedNumAtoms(), 4 * mixedSize, "vrattleOldVelocities");
     for (OpenMM::ComputeArray& array : trials)
         array.initialize(context, Control::TrialSize, wideSize, "vrattleTrial");
-    failure.initialize<int>(context, 2, "vrattleFailure");
-    failure.upload(vector<int>{0, 0});
+    failure.initialize<int>(context, 3, "vrattleFailure");
+    failure.upload(vector<int>{0, 0, 0});
     iterationCounts.initialize<int>(context, numGroups * groupSize, "vrattleIterations");
     context.clearBuffer(iterationCounts);
     noise.initialize<int>(context, 5, "vrattleNoise");
@@ -170,9 +170,7 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
     settings = newSettings;
     if (isLangevin())
         settings.terms = {{StepMonitor::ConstraintAndAppliedForce, 1, 1, 1}}; // stands for its own monitor
-    compile(settings.isAutomatic ? StepProgram::Automatic
-            : isLangevin()       ? StepProgram::Langevin
-                                 : StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update));
+    compile();
     vector<double> numbers(program->getNumSettings());
     numbers[Control::Nominal] = settings.stepSize;
     numbers[Control::Smallest] = settings.density.smallest;
@@ -202,10 +200,26 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
     settingsArray.upload(numbers, true);
 }
 
-void DeviceSteps::compile(StepProgram::Update update) {
-    std::unique_ptr<StepProgram> next(new StepProgram(layout, large,
-                                                      expressions ? &expressions->getClusters() : nullptr,
-                                                      large.getNumThreads(), settings.terms, update, isMixed, isWide));
+StepProgram::Update DeviceSteps::findUpdate() const {
+    return settings.isAutomatic ? StepProgram::Automatic
+           : isLangevin()       ? StepProgram::Langevin
+                                : StepProgram::updateOf(settings.terms, settings.isFixedStep, settings.update);
+}
+
+bool DeviceSteps::prepareNewton() {
+    if (newton || !NewtonSteps::canTake(large))
+        return false;
+    OpenMM::ContextSelector selector(context);
+    newton = std::make_unique<NewtonSteps>(context, large, isMixed);
+    compile();
+    return true;
+}
+
+void DeviceSteps::compile() {
+    const StepProgram::Update update = findUpdate();
+    std::unique_ptr<StepProgram> next(new StepProgram(
+        layout, large, expressions ? &expressions->getClusters() : nullptr, newton ? &newton->getClusters() : nullptr,
+        large.getNumThreads(), settings.terms, update, isMixed, isWide));
     const bool isFirst = program == nullptr;
     program.swap(next);
     if (isFirst)
@@ -263,6 +277,12 @@ void DeviceSteps::compile(StepProgram::Update update) {
                 {settingsArray, partials, jumpPartials, failure, oldPositions, oldVelocities, numGroups, numPartials});
             addLastState(created.expressions.finish);
             addNoiseState(created.expressions.advance);
+        }
+        if (newton) {
+            created.newton = newton->create(text, program->hasHalfSums(),
+                                            {settingsArray, failure, oldPositions, oldVelocities, largePhases,
+                                             largeMultipliers, largeIterations, numPartials});
+            addNoiseState(created.newton.advance);
         }
         found = compiled.insert({key, created}).first;
     }
@@ -559,8 +579,12 @@ vector<double> DeviceSteps::readReport() {
     return block;
 }
 
-void DeviceSteps::clearFailure() {
-    failure.upload(vector<int>{0, 0});
+// Returns whether a large cluster was not solved.
+bool DeviceSteps::clearFailure() {
+    vector<int> codes;
+    failure.download(codes);
+    failure.upload(vector<int>{0, 0, 0});
+    return codes[2] != 0;
 }
 
 // Parameters that move, or have moved and stop, come first.
@@ -607,6 +631,11 @@ void DeviceSteps::advance(double maxStep) {
                 kernels.tryLarge->setArg(8, trialPartials[(i + 1) % 2]);
                 launchLarge(kernels.tryLarge, stepNumber, getMaxStages());
             }
+            if (newton) {
+                newton->launchTrial(kernels.newton, stepNumber, settings.tolerance, trials[(i + 1) % 2],
+                                    trialPartials[(i + 1) % 2]);
+                numLaunches++;
+            }
         }
     kernels.advance->setArg(0, stepNumber);
     setWide(kernels.advance, 1, groupEnergy);
@@ -627,6 +656,10 @@ void DeviceSteps::advance(double maxStep) {
         setMixed(kernels.advanceLarge, 5, settings.tolerance);
         kernels.advanceLarge->setArg(6, control[half]);
         launchLarge(kernels.advanceLarge, stepNumber, getMaxStages());
+    }
+    if (newton) {
+        newton->launchAdvance(kernels.newton, stepNumber, settings.tolerance, control[half]);
+        numLaunches++;
     }
 }
 
@@ -681,7 +714,7 @@ DeviceSteps::Report DeviceSteps::undo(int numSteps, int code, bool hasSums) {
         kernels.restore->execute(context.getNumAtoms());
     if (numSteps % 2 == 1)
         half = 1 - half;
-    clearFailure();
+    const bool isForNewton = clearFailure();
     if (hasSums)
         launchEvaluate(NO_STEP, Control::NothingChanged, false);
     vector<double> block;
@@ -697,6 +730,7 @@ DeviceSteps::Report DeviceSteps::undo(int numSteps, int code, bool hasSums) {
     }
     Report report = fill(block);
     report.state.hasHalfStepValue = report.state.hasHalfStepValue && hasSums;
+    report.isForNewton = isForNewton && (code == Control::NotConverged || code == Control::UnsolvedDensity);
     return report;
 }
 

@@ -6,6 +6,7 @@
 
 #include "ExpressionSteps.h"
 #include "LargeClusters.h"
+#include "NewtonSteps.h"
 #include "StepProgram.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
@@ -68,6 +69,7 @@ public:
         std::vector<double> values; // u(q[n],p[n]) and U_k; with automatic step control U_A[n] and U_B[n-1/2]
         bool isShortened; // the last step was cut short
         bool hasFailed;
+        bool isForNewton; // in a large cluster whose chord iteration has not converged, see prepareNewton()
     };
 
     /** Whether all constraints are of those that the device can solve. */
@@ -115,6 +117,11 @@ public:
      * those before it, those after it have not happened, and begin() is due after the forces. numSteps counts those completed.
      */
     Report read();
+    /**
+     * From the next step on follow chord iterations that do not converge by Newton's. Compiles a program; begin() is due. Returns whether
+     * that is new.
+     */
+    bool prepareNewton();
     /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
     Report putBack();
     /** Lambda(q[n],p[n]) of the expressions, all that were given, where the steps have led that were read last. Waits for the device. */
@@ -148,9 +155,11 @@ private:
         ExpressionSteps::Kernels expressions;
         OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
         OpenMM::ComputeKernel finishLarge, tryLarge, advanceLarge;
+        NewtonSteps::Kernels newton;
     };
     void initialize();
-    void compile(StepProgram::Update update);
+    StepProgram::Update findUpdate() const;
+    void compile();
     bool isLangevin() const {
         return settings.langevin.has_value();
     }
@@ -170,7 +179,7 @@ private:
     void launchFinish(int step, double kick, Control::Change change, bool isStored);
     void launchEvaluate(int step, Control::Change change, bool isReported);
     std::vector<double> readReport();
-    void clearFailure();
+    bool clearFailure();
     void beginExpressionStep();
     Report undo(int numSteps, int code, bool hasSums);
     Report fill(const std::vector<double>& block);
@@ -178,6 +187,7 @@ private:
     std::unique_ptr<ExpressionSteps> expressions; // or null
     const ClusterLayout& layout;
     LargeClusters large;
+    std::unique_ptr<NewtonSteps> newton; // or null, at first
     Settings settings;
     std::unique_ptr<StepProgram> program;
     bool isMixed, isWide; // mixed is double; there are doubles

@@ -125,6 +125,40 @@ ExpressionClusters::ExpressionClusters(const ClusterLayout& layout, const vector
     addPart(open, layout.inverseMasses);
 }
 
+ExpressionClusters::ExpressionClusters(const LargeClusters& large) :
+        parameters(large.getNumConstraints()), numParameters(0), numConstraints(0), numLevels(0), numWork(0),
+        numFactorEntries(0) {
+    kindOf({DISTANCE_EXPRESSION, {0, 1}, {{"length", 1.0}}});
+    const auto& pieces = large.getPieces();
+    const vector<double> areMoving(1 + *std::max_element(large.getAtoms().begin(), large.getAtoms().end()), 1.0);
+    for (size_t first = 0; first < pieces.size(); first += pieces[first].numPieces) {
+        vector<Row> rows;
+        vector<vector<int>> particlesOf;
+        std::map<int, int> places; // of the particles of the cluster
+        for (size_t piece = first; piece < first + pieces[first].numPieces; piece++)
+            for (int i = 0; i < pieces[piece].numInner + pieces[piece].numBorders; i++) {
+                const int place = pieces[piece].firstRow + i;
+                const LargeClusters::Row& row = large.getRows()[place];
+                if (row.number < 0)
+                    continue; // another piece's
+                rows.push_back({DISTANCE, row.number, NONE, {row.atom1, row.atom2}});
+                parameters[row.number] = large.getRowLengths()[place];
+                particlesOf.emplace_back();
+                for (int atom : {row.atom1, row.atom2})
+                    particlesOf.back().push_back(places.emplace(atom, (int) places.size()).first->second);
+            }
+        const ClusterElimination elimination(particlesOf, leaveWhole(particlesOf), ClusterElimination::FewLevels);
+        const ClusterElimination::Piece& whole = elimination.pieces[0];
+        Part part;
+        for (int k : whole.constraints)
+            part.rows.push_back(rows[k]);
+        part.firstRows = {0};
+        part.levels = whole.levels;
+        part.columns = whole.columns;
+        addPart(part, areMoving);
+    }
+}
+
 ExpressionClusters::Kind ExpressionClusters::nameKind(const ExpressionConstraint& constraint) {
     Kind kind(constraint.expression, {std::to_string(constraint.particles.size())});
     for (const auto& parameter : constraint.parameters)

@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 #define OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 
+#include "LargeClusters.h"
 #include "constraints/ClusterLayout.h"
 #include "expressions/ExpressionDerivatives.h"
 #include <cstddef>
@@ -30,6 +31,11 @@ public:
     static const int NUM_TERMS = 6;
 
     ExpressionClusters(const ClusterLayout& layout, const std::vector<ExpressionConstraint>& expressions);
+    /**
+     * The large clusters of distances, each a part of its own. The parameter of a row is the length of its constraint, by the number that
+     * this has there.
+     */
+    explicit ExpressionClusters(const LargeClusters& large);
     bool isEmpty() const {
         return parts.empty();
     }

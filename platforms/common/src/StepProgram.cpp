@@ -142,8 +142,8 @@ vector<const ClusterKind*> StepProgram::findSmallKinds(const ClusterLayout& layo
 }
 
 StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large, const ExpressionClusters* expressions,
-                         int numThreads, const vector<StepMonitor::Term>& terms, Update update, bool isMixed,
-                         bool isWide) : numMonitors((int) terms.size()), update(update) {
+                         const ExpressionClusters* newton, int numThreads, const vector<StepMonitor::Term>& terms,
+                         Update update, bool isMixed, bool isWide) : numMonitors((int) terms.size()), update(update) {
     const bool areShared = !large.isEmpty() || expressions != nullptr;
     if (areShared)
         defines["NUM_THREADS"] = to_string(numThreads);
@@ -152,8 +152,8 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
     const int numKept = writeClusters(findSmallKinds(layout), large.getLocalMemory() / bytesOfGroup);
     writeLargeClusters(large, numKept * bytesOfGroup);
     words["EXPRESSION_CLUSTERS"] = "";
-    if (expressions != nullptr)
-        writeExpressions(*expressions);
+    if (expressions != nullptr || newton != nullptr)
+        writeExpressions(expressions, newton);
     writeAutomaticControl((int) large.getPieces().size());
     words["LANGEVIN_FUNCTIONS"] = update == Langevin
                                       ? DeviceSources::langevin
@@ -163,6 +163,8 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
     for (const auto& word : words)
         replaceAll(source, word.first, word.second);
     const map<string, int> numbers = {{"GROUP_SIZE", getGroupSize(areShared)},
+                                      {"HAS_EXPRESSIONS", expressions != nullptr},
+                                      {"HAS_NEWTON", newton != nullptr},
                                       {"FIXED", Fixed},
                                       {"SUM", Sum},
                                       {"BOUNDED", Bounded},
@@ -456,10 +458,14 @@ void StepProgram::writeAutomaticControl(int numPieces) {
     defines["CHANGE_WEIGHT"] = literal(AutomaticControl::CHANGE_WEIGHT);
 }
 
-void StepProgram::writeExpressions(const ExpressionClusters& expressions) {
+void StepProgram::writeExpressions(const ExpressionClusters* expressions, const ExpressionClusters* newton) {
     string& text = words["EXPRESSION_CLUSTERS"];
-    text = DeviceSources::expression + DeviceSources::moving;
-    replaceAll(text, "EXPRESSION_FUNCTIONS", expressions.writeFunctions());
+    text = DeviceSources::expression;
+    if (expressions != nullptr)
+        text += DeviceSources::moving;
+    if (newton != nullptr)
+        text += DeviceSources::newton;
+    replaceAll(text, "EXPRESSION_FUNCTIONS", (expressions != nullptr ? expressions : newton)->writeFunctions());
     defines["EXPRESSION_LENGTH"] = literal(ConstraintSystem::EXPRESSION_LENGTH);
     defines["MAX_CHORD_ITERATIONS"] = to_string(MAX_CHORD_ITERATIONS);
     defines["SMALLEST_SHARE"] = "1e-4f";

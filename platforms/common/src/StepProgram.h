@@ -84,7 +84,7 @@ public:
     };
     static const int SLOT_UNIT = 32;
     /**
-     * Of a large cluster: an iteration that takes longer is left to the host. There are two in a step of Langevin dynamics. Stages that
+     * Of a large cluster: an iteration that takes longer is left to Newton's, or to the host. There are two in a step of Langevin dynamics. Stages that
      * nobody needs cost nothing, unless each is a launch.
      */
     static constexpr int getMaxStages(Update update, bool isStaged) {
@@ -95,6 +95,7 @@ public:
      * @param layout        the clusters, of which small ones are for one thread each
      * @param large         those of more distances
      * @param expressions   those with constraints given as expressions, or null
+     * @param newton        the large ones once more, for Newton's iteration where the chord's fails, or null
      * @param numThreads    of a group that works on one of the last two
      * @param terms         the monitors; none with automatic step control, and Langevin dynamics has its own, the only one
      * @param update        how the density is found
@@ -102,7 +103,8 @@ public:
      * @param isWide        whether the device has doubles
      */
     StepProgram(const ClusterLayout& layout, const LargeClusters& large, const ExpressionClusters* expressions,
-                int numThreads, const std::vector<StepMonitor::Term>& terms, Update update, bool isMixed, bool isWide);
+                const ExpressionClusters* newton, int numThreads, const std::vector<StepMonitor::Term>& terms,
+                Update update, bool isMixed, bool isWide);
     /** The clusters that are small and free particles, in the order of their slots: those with most constraints first. */
     static std::vector<const ClusterKind*> findSmallKinds(const ClusterLayout& layout);
     /** The threads of a work group. */
@@ -153,7 +155,7 @@ private:
     int writeClusters(const std::vector<const ClusterKind*>& kinds, int mostKept);
     void writeLargeClusters(const LargeClusters& large, int bytesKept);
     void writeAutomaticControl(int numPieces);
-    void writeExpressions(const ExpressionClusters& expressions);
+    void writeExpressions(const ExpressionClusters* expressions, const ExpressionClusters* newton);
     std::string source;
     std::map<std::string, std::string> defines, words;
     std::vector<Place> places;

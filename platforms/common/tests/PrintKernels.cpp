@@ -3,7 +3,8 @@
 
 // Writes the text that devices are given, for compilers that need no device: PrintKernels <precision> <monitor> <update> <graphs>
 // with the numbers of a monitor and an update (3 for automatic step control, 4 for Langevin dynamics), and graphs "common" (hydrogens
-// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other, and a short one), "dense" (many bonds on one particle), "expressions" (angles, and all functions), or "rare" with the number of a graph of up to
+// on heavy atoms, rigid water), "large" (a long chain too, in pieces that wait for each other, and a short one), "newton" (the same with
+// Newton's iteration), "dense" (many bonds on one particle), "expressions" (angles, and all functions), or "rare" with the number of a graph of up to
 // eight constraints, for that alone.
 
 #include "StepProgram.h"
@@ -17,11 +18,12 @@ using std::vector;
 
 int main(int argc, char** argv) {
     if (argc != 5) {
-        std::cerr << "PrintKernels <precision> <monitor> <update> common|large|dense|expressions|rare<number>"
+        std::cerr << "PrintKernels <precision> <monitor> <update> common|large|newton|dense|expressions|rare<number>"
                   << std::endl;
         return 2;
     }
-    const string precision = argv[1], graphs = argv[4];
+    const bool hasNewton = string(argv[4]) == "newton";
+    const string precision = argv[1], graphs = hasNewton ? "large" : argv[4];
     vector<double> masses;
     vector<DistanceConstraint> distances;
     auto add = [&](const vector<std::pair<int, int>>& pairs) {
@@ -91,8 +93,9 @@ int main(int argc, char** argv) {
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
     const LargeClusters large(layout,
                               {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
-    const StepProgram program(layout, large, clusters.get(), StepProgram::getGroupSize(true), terms, update,
-                              precision != "single", true);
+    const std::unique_ptr<ExpressionClusters> newton(hasNewton ? new ExpressionClusters(large) : nullptr);
+    const StepProgram program(layout, large, clusters.get(), newton.get(), StepProgram::getGroupSize(true), terms,
+                              update, precision != "single", true);
     for (const auto& define : program.getDefines())
         std::cout << "#define " << define.first << " " << define.second << "\n";
     std::cout << program.getSource();

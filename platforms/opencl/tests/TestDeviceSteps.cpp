@@ -706,42 +706,101 @@ void testMovingParameters(const std::string& precision, const vector<StepDensity
     }
 }
 
-// A long chain that is nearly straight moves across itself: there the chord iteration does not contract. In a cluster with an expression
-// Newton's follows on the device; without, the step is the host's.
-void testNewton() {
-    for (bool hasExpression : {false, true}) {
-        Molecules molecules(0);
-        const int length = 150, first = (int) molecules.masses.size();
-        vector<Vec3> straight;
-        for (int i = 0; i <= length; i++)
-            straight.push_back(Vec3(0.13 * (i - length / 2), 1e-3 * std::sin(i), 1e-3 * std::cos(2 * i)));
-        molecules.addLarge(makeChain(length), 12, straight);
-        for (int i = first; i <= first + length; i++)
-            molecules.velocities[i] *= 3;
-        if (hasExpression)
-            molecules.addExpression("x1*y1", {first});
-        Both both(molecules, "double");
-        both.settings = {0.001, 0, 0, 1e-10, StepDensity::Explicit, {}, false};
-        both.dynamics.setSettings(both.settings);
-        const vector<Vec3> forces = both.forcesAt(molecules.positions);
-        both.dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
-        both.context.setPositions(both.dynamics.getPositions());
-        both.context.setVelocities(both.dynamics.getVelocities());
-        both.computeForces();
-        both.device.setSettings(
-            {0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-10, {}});
-        ASSERT(both.device.begin({1, 0, false, 0}, 0));
-        both.stepOnDevice();
-        const DeviceSteps::Report report = both.device.read();
-        ASSERT_EQUAL(!hasExpression, report.hasFailed);
-        if (!hasExpression)
-            continue;
-        ASSERT(both.device.getNumIterations() >= 3);
-        const vector<Vec3> positions = both.positions(), velocities = both.velocities();
-        both.stepOnHost();
-        ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= 1e-9);
-        ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1e-6);
-    }
+// Where the chord iteration does not contract Newton's follows; in a cluster of distances alone from the first time that it is needed. A
+// long chain that is nearly straight moves across itself.
+Molecules makeStraightChain() {
+    Molecules molecules(0);
+    const int length = 150;
+    vector<Vec3> straight;
+    for (int i = 0; i <= length; i++)
+        straight.push_back(Vec3(0.13 * (i - length / 2), 1e-3 * std::sin(i), 1e-3 * std::cos(2 * i)));
+    molecules.addLarge(makeChain(length), 12, straight);
+    for (size_t i = molecules.masses.size() - length - 1; i < molecules.masses.size(); i++)
+        molecules.velocities[i] *= 3;
+    return molecules;
+}
+
+// The velocities of a zigzag whose bonds are turned by some 50 degrees in a drift of 1/(20 speed) ps.
+vector<Vec3> turningVelocities(const Molecules& molecules, double speed) {
+    vector<Vec3> velocities(molecules.masses.size());
+    for (size_t i = 1; i < velocities.size(); i++) // the first does not move
+        velocities[i] = Vec3(0, 0, i % 4 < 2 ? 1.2 : -1.2) * speed;
+    return velocities;
+}
+
+Molecules makeZigzag() {
+    Molecules molecules(0);
+    vector<Vec3> places;
+    for (int i = 0; i <= 24; i++)
+        places.push_back(Vec3(0.12 * (i - 12), 0.09 * (i % 2), 0));
+    molecules.addLarge(makeChain(24), 12, places);
+    return molecules;
+}
+
+// One step, which is taken again where it is found that Newton's iteration is needed.
+void requireNewton(DeviceSteps& device, bool isExpected, const std::function<void()>& stepOnDevice,
+                   const std::function<void(const DeviceSteps::State&)>& begin) {
+    stepOnDevice();
+    const DeviceSteps::Report report = device.read();
+    ASSERT_EQUAL(isExpected, report.hasFailed);
+    ASSERT_EQUAL(isExpected, report.isForNewton);
+    if (!isExpected)
+        return;
+    ASSERT(device.prepareNewton());
+    ASSERT(!device.prepareNewton());
+    begin(report.state);
+    stepOnDevice();
+    ASSERT(!device.read().hasFailed);
+}
+
+void testNewton(bool hasExpression) {
+    Molecules molecules = makeStraightChain();
+    if (hasExpression)
+        molecules.addExpression("x1*y1", {(int) molecules.masses.size() - 1});
+    Both both(molecules, "double");
+    both.settings = {0.001, 0, 0, 1e-10, StepDensity::Explicit, {}, false};
+    both.dynamics.setSettings(both.settings);
+    const vector<Vec3> forces = both.forcesAt(molecules.positions);
+    both.dynamics.begin(molecules.positions, molecules.velocities, forces, 0);
+    both.handOver();
+    requireNewton(
+        both.device, !hasExpression, [&] { both.stepOnDevice(); },
+        [&](const DeviceSteps::State& state) {
+            both.computeForces();
+            ASSERT(both.device.begin(state, 0));
+        });
+    ASSERT(both.device.getNumIterations() >= 3);
+    const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+    both.stepOnHost();
+    ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= 1e-9);
+    ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1e-6);
+    if (hasExpression)
+        return;
+    // A launch more.
+    const long long launches = both.device.getNumLaunches();
+    both.stepOnDevice();
+    ASSERT_EQUAL(2 + (both.device.getLargeClusters().getForm().isStaged ? 3 + 16 : 2) + 1,
+                 both.device.getNumLaunches() - launches);
+}
+
+void testNewtonForDensity() {
+    const Molecules molecules = makeZigzag();
+    Both both(molecules, "double");
+    both.start(molecules, StepDensity::SemiExplicit, {{StepMonitor::VectorField, 1, 0.1, 0}});
+    const vector<Vec3> turning = turningVelocities(molecules, 40);
+    const vector<Vec3> forces = both.forcesAt(both.dynamics.getPositions());
+    both.dynamics.changeState(both.dynamics.getPositions(), turning, forces, both.groupEnergy());
+    both.handOver();
+    requireNewton(
+        both.device, true, [&] { both.stepOnDevice(); },
+        [&](const DeviceSteps::State& state) {
+            both.computeForces();
+            ASSERT(both.device.begin(state, 0));
+        });
+    const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+    both.stepOnHost();
+    ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= 1e-9);
+    ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1e-6);
 }
 
 // A chain of light and heavy particles, bent and straight: to the tolerance.
@@ -1257,6 +1316,20 @@ void testLangevinAgrees(const Molecules& molecules, const std::string& precision
     }
 }
 
+void testNewtonOfLangevin() {
+    Molecules molecules = makeZigzag();
+    molecules.velocities = turningVelocities(molecules, 66);
+    BothLangevin both(molecules, "double");
+    both.dynamics.setReferences({100 * both.dynamics.getMonitorValues()[0]}); // no step needs substeps
+    both.handOver();
+    requireNewton(both.device, true, [&] { both.stepOnDevice(); }, [&](const DeviceSteps::State&) { both.handOver(); });
+    const vector<Vec3> positions = both.positions(), velocities = both.velocities();
+    both.stepOnHost();
+    ASSERT_EQUAL(0, both.dynamics.getNumSubstepped());
+    ASSERT(largestDifference(positions, both.dynamics.getPositions()) <= 1e-9);
+    ASSERT(largestDifference(velocities, both.dynamics.getVelocities()) <= 1e-6);
+}
+
 // Which constraints the device solves, and which are left to the host.
 void testWhatItTakes() {
     ASSERT(DeviceSteps::canTake({}));
@@ -1322,7 +1395,10 @@ int main(int argc, char** argv) {
         {"moving parameters, double",
          [] { testMovingParameters("double", {StepDensity::SemiExplicit, StepDensity::Explicit}, 1e-12, 1e-9); }},
         {"moving parameters, mixed", [] { testMovingParameters("mixed", {StepDensity::Explicit}, 1e-9, 1e-6); }},
-        {"Newton's iteration with expressions", testNewton},
+        {"Newton's iteration with expressions", [] { testNewton(true); }},
+        {"Newton's iteration of a large cluster", [] { testNewton(false); }},
+        {"Newton's iteration of a large cluster for (3.14)", testNewtonForDensity},
+        {"Newton's iteration of a large cluster in Langevin dynamics", testNewtonOfLangevin},
         {"changed velocities", testChangedVelocities},
         {"automatic step control, double", [] { testAutomaticControl(Molecules(2), "double", 1e-12, 1e-9); }},
         {"automatic step control of large clusters, double",

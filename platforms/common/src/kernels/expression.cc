@@ -2,7 +2,8 @@
 // SPDX-License-Identifier: MIT
 
 // Clusters with constraints that are given as expressions, in parts (ExpressionClusters.h): a work group has a part, whose rows are
-// those of any number of whole clusters. A row of G has an entry, a vector, for each particle of its expression. K = G M^-1 G^T = L D L^T
+// those of any number of whole clusters. (So has Newton's iteration of large clusters of distances, newton.cc.)
+// A row of G has an entry, a vector, for each particle of its expression. K = G M^-1 G^T = L D L^T
 // is that of the on-step positions; finish makes it, and the step from there uses it again. Where that chord iteration does
 // not contract, Newton's follows, with A = G(q+) M^-1 G(q)^T = L D U in place of K, which has the same pattern.
 //
@@ -402,13 +403,13 @@ inline DEVICE mixed findLargest(mixed value, LOCAL_ARG mixed* buffer) {
 
 /**
  * Solve g(q + base + M^-1 G^T gamma) = 0 from gamma = -guess lambda; moved is the way there, and acceleration what it leads to. G and the
- * factor of K are those of q. Returns the number of iterations, or -1 if they
+ * factor of K, of no use where it is Newton's iteration from the first, are those of q. Returns the number of iterations, or -1 if they
  * do not converge. There is at least one, since lambda itself, unrefined, costs accuracy even where it meets the tolerance.
  */
-inline DEVICE int solvePart(const Part* part, mixed guess, mixed tolerance, const Parameters* theta, LOCAL_ARG mixed* buffer) {
+inline DEVICE int solvePart(const Part* part, bool isNewton, mixed guess, mixed tolerance, const Parameters* theta, LOCAL_ARG mixed* buffer) {
     findScales(part, theta->next);
     int iterations = 0, sinceGuess = 0, result = -1;
-    bool isNewton = false, isGuess = true;
+    bool isGuess = true;
     mixed previous = 1e30f, share = 1; // of Newton's update, which right keeps
     KEEP_LOOP for (int i = 0; i < MAX_PART_ITERATIONS && result < 0; i++) {
         if (isGuess)
@@ -493,7 +494,14 @@ inline DEVICE bool turnPart(const Part* part, mixed drift, const Parameters* the
 
 #endif
 
-// ------------------------------------------------------------------------------------------------------------------- the kernels
+// The noise of Langevin dynamics, once for all particles.
+#if UPDATE == LANGEVIN
+#define NOISE_PARAMETERS_OF_PART , Noise noise, GLOBAL const int* RESTRICT atomIndex
+#define NOISE_ARGUMENTS_OF_PART , noise, atomIndex
+#else
+#define NOISE_PARAMETERS_OF_PART
+#define NOISE_ARGUMENTS_OF_PART
+#endif
 
 #define EXPRESSION_MEMORY LOCAL mixed buffer[PIECE_SUMS];
 #if NUM_THREADS > 1
@@ -501,6 +509,84 @@ inline DEVICE bool turnPart(const Part* part, mixed drift, const Parameters* the
 #else
 #define MERGE_PART_SUMS(sums)
 #endif
+
+#if HALF_SUMS
+
+/** A step of size dt and its monitors, for (3.14). Returns the number of iterations, or -1 if they do not converge. */
+inline DEVICE int tryPart(const Part* part, bool isNewton, mixed dt, mixed tolerance, const Parameters* theta, EXPRESSION_STATE_PARAMETERS, mixed* sums, LOCAL_ARG mixed* buffer) {
+    loadPart(part, dt, dt/2, EXPRESSION_STATE_ARGUMENTS);
+    findRows(part, part->position, theta->here, part->G);
+    if (isNewton) { // else there is a factor
+        formMatrix(part, part->G, part->G, true, part->pivots, part->lower, part->lower);
+        factorizePart(part, true, part->pivots, part->lower, part->lower);
+    }
+    const int iterations = solvePart(part, isNewton, dt*dt/2, tolerance, theta, buffer);
+    if (iterations >= 0) // where the next trial starts
+        KEEP_LOOP for (int k = THREAD; k < part->numRows; k += NUM_THREADS)
+            part->multipliers[k] = -2*part->gamma[k]/(dt*dt);
+    KEEP_LOOP for (int j = THREAD; j < part->numParticles; j += NUM_THREADS) {
+        mixed a[3];
+        loadAcceleration(force, paddedNumAtoms, part->atoms[j], part->inverseMass[j], a);
+        UNROLL for (int d = 0; d < 3; d++) {
+            part->acceleration[3*j+d] = a[d];
+            part->moved[3*j+d] *= 1/dt;
+        }
+    }
+    SYNC_PIECE;
+    measurePart(part, part->moved, theta, theta->here, 1/dt, force, paddedNumAtoms, sums);
+    if (iterations < 0 && THREAD == 0)
+        sums[FAILURES] += 1;
+    MERGE_PART_SUMS(sums);
+    return iterations;
+}
+
+#endif
+
+/**
+ * (3.9)-(3.11) for a step of size dt; first are the parameters of the first drift in Langevin dynamics. Returns the number of iterations, or -1 if they do not
+ * converge.
+ */
+inline DEVICE int advancePart(const Part* part, bool isNewton, int step, mixed dt, mixed tolerance, const Parameters* first, const Parameters* theta, EXPRESSION_STATE_PARAMETERS, GLOBAL int* RESTRICT failure,
+        GLOBAL mixed4* RESTRICT oldPositions, GLOBAL mixed4* RESTRICT oldVelocities, LOCAL_ARG mixed* buffer NOISE_PARAMETERS_OF_PART) {
+    const mixed drift = (UPDATE == LANGEVIN ? dt/2 : dt), inverse = (drift > 0 ? 1/drift : (mixed) 0);
+    loadPart(part, drift, dt/2, EXPRESSION_STATE_ARGUMENTS);
+    KEEP_LOOP for (int j = THREAD; j < part->numParticles; j += NUM_THREADS)
+        if (part->inverseMass[j] > 0) {
+            const int atom = part->atoms[j];
+            mixed x[3];
+            const real charge = loadPosition(posq, posqCorrection, atom, x);
+            oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
+            oldVelocities[atom] = velm[atom];
+        }
+    findRows(part, part->position, theta->here, part->G);
+    int iterations = solvePart(part, isNewton, dt/2*drift, tolerance, first, buffer);
+#if UPDATE == LANGEVIN
+    const bool isRegular = turnPart(part, drift, first, noise, atomIndex);
+    const int more = solvePart(part, isNewton, 0, tolerance, theta, buffer);
+    iterations = (iterations < 0 || more < 0 ? -1 : iterations + more);
+    if (!isRegular)
+        fail(failure, step, IRREGULAR);
+#endif
+    KEEP_LOOP for (int j = THREAD; j < (iterations >= 0 ? part->numParticles : 0); j += NUM_THREADS)
+        if (part->inverseMass[j] > 0) {
+            const int atom = part->atoms[j];
+            const mixed4 old = oldPositions[atom];
+            const mixed x = part->moved[3*j], y = part->moved[3*j+1], z = part->moved[3*j+2];
+#if UPDATE == LANGEVIN
+            storePosition(posq, posqCorrection, atom, old.x + (part->before[3*j] + x), old.y + (part->before[3*j+1] + y), old.z + (part->before[3*j+2] + z), (real) old.w);
+#else
+            storePosition(posq, posqCorrection, atom, old.x + x, old.y + y, old.z + z, (real) old.w);
+#endif
+            velm[atom] = make_mixed4(inverse*x, inverse*y, inverse*z, part->inverseMass[j]);
+        }
+    if (THREAD == 0 && iterations < 0)
+        fail(failure, step, NOT_CONVERGED);
+    return iterations;
+}
+
+// ------------------------------------------------------------------------------------------------------------------- the kernels
+
+#if HAS_EXPRESSIONS
 
 /** finishStep for the parts. */
 KERNEL void finishExpressions(int step, mixed kick, int isFormed, int isStored, GLOBAL const wide* RESTRICT control, GLOBAL const wide* RESTRICT settings,
@@ -577,25 +663,7 @@ KERNEL void tryExpressions(int step, mixed tolerance, GLOBAL const wide* RESTRIC
         const Part part = OPEN_PART;
         for (int j = 0; j < NUM_SUMS; j++)
             sums[j] = 0;
-        loadPart(&part, dt, dt/2, EXPRESSION_STATE_ARGUMENTS);
-        findRows(&part, part.position, theta.here, part.G);
-        const int iterations = solvePart(&part, dt*dt/2, tolerance, &theta, buffer);
-        if (iterations >= 0) // where the next trial starts
-            KEEP_LOOP for (int k = THREAD; k < part.numRows; k += NUM_THREADS)
-                part.multipliers[k] = -2*part.gamma[k]/(dt*dt);
-        KEEP_LOOP for (int j = THREAD; j < part.numParticles; j += NUM_THREADS) {
-            mixed a[3];
-            loadAcceleration(force, paddedNumAtoms, part.atoms[j], part.inverseMass[j], a);
-            UNROLL for (int d = 0; d < 3; d++) {
-                part.acceleration[3*j+d] = a[d];
-                part.moved[3*j+d] *= 1/dt;
-            }
-        }
-        SYNC_PIECE;
-        measurePart(&part, part.moved, &theta, theta.here, 1/dt, force, paddedNumAtoms, sums);
-        if (iterations < 0 && THREAD == 0)
-            sums[FAILURES] += 1;
-        MERGE_PART_SUMS(sums);
+        tryPart(&part, false, dt, tolerance, &theta, EXPRESSION_STATE_ARGUMENTS, sums, buffer);
         if (THREAD == 0)
             for (int j = 0; j < NUM_SUMS; j++)
                 nextPartials[j*numPartials + firstPartial + i] = sums[j];
@@ -614,49 +682,17 @@ KERNEL void advanceExpressions(int step, mixed tolerance, GLOBAL const wide* RES
 #if UPDATE == LANGEVIN
     first.next = middleParameters;
 #endif
-    const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
-    const mixed dt = (mixed) nextControl[STEP_SIZE], drift = (UPDATE == LANGEVIN ? dt/2 : dt), inverse = (drift > 0 ? 1/drift : (mixed) 0);
 #if UPDATE == LANGEVIN
     const Noise noise = makeNoise(step, noiseState, settings);
 #endif
-    KEEP_LOOP for (int i = (isFrozen ? numParts : GROUP_ID); i < numParts; i += NUM_GROUPS) {
+    KEEP_LOOP for (int i = (HAS_NO_STEP(failure, step) ? numParts : GROUP_ID); i < numParts; i += NUM_GROUPS) {
         const Part part = OPEN_PART;
-        loadPart(&part, drift, dt/2, EXPRESSION_STATE_ARGUMENTS);
-        KEEP_LOOP for (int j = THREAD; j < part.numParticles; j += NUM_THREADS)
-            if (part.inverseMass[j] > 0) {
-                const int atom = part.atoms[j];
-                mixed x[3];
-                const real charge = loadPosition(posq, posqCorrection, atom, x);
-                oldPositions[atom] = make_mixed4(x[0], x[1], x[2], charge);
-                oldVelocities[atom] = velm[atom];
-            }
-        findRows(&part, part.position, theta.here, part.G);
-        int iterations = solvePart(&part, dt/2*drift, tolerance, &first, buffer);
-#if UPDATE == LANGEVIN
-        const bool isRegular = turnPart(&part, drift, &first, noise, atomIndex);
-        const int more = solvePart(&part, 0, tolerance, &theta, buffer);
-        iterations = (iterations < 0 || more < 0 ? -1 : iterations + more);
-        if (!isRegular)
-            fail(failure, step, IRREGULAR + NUM_CODES*i);
-#endif
-        KEEP_LOOP for (int j = THREAD; j < (iterations >= 0 ? part.numParticles : 0); j += NUM_THREADS)
-            if (part.inverseMass[j] > 0) {
-                const int atom = part.atoms[j];
-                const mixed4 old = oldPositions[atom];
-                const mixed x = part.moved[3*j], y = part.moved[3*j+1], z = part.moved[3*j+2];
-#if UPDATE == LANGEVIN
-                storePosition(posq, posqCorrection, atom, old.x + (part.before[3*j] + x), old.y + (part.before[3*j+1] + y), old.z + (part.before[3*j+2] + z), (real) old.w);
-#else
-                storePosition(posq, posqCorrection, atom, old.x + x, old.y + y, old.z + z, (real) old.w);
-#endif
-                velm[atom] = make_mixed4(inverse*x, inverse*y, inverse*z, part.inverseMass[j]);
-            }
-        if (THREAD == 0) {
-            if (iterations < 0)
-                fail(failure, step, NOT_CONVERGED + NUM_CODES*i);
-            else
-                partIterations[i] += iterations;
-        }
+        const int iterations = advancePart(&part, false, step, (mixed) nextControl[STEP_SIZE], tolerance, &first, &theta, EXPRESSION_STATE_ARGUMENTS, failure,
+                oldPositions, oldVelocities, buffer NOISE_ARGUMENTS_OF_PART);
+        if (THREAD == 0 && iterations >= 0)
+            partIterations[i] += iterations;
         SYNC_PIECE;
     }
 }
+
+#endif

@@ -805,12 +805,16 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
         KEEP_LOOP for (int i = THREAD; i < numKept; i += NUM_THREADS)
             kept[i] = A[i];
     SYNC_PIECE;
-#else
+#endif
+#if HAS_NEWTON || !IN_LOCAL_MEMORY
     if (THREAD == 0)
         phases[piece] = phase + NUM_PHASES*flags[(task.endStage - 1) & 1];
 #endif
     return completed | (mode != FINISH && phase != COMPLETE ? 4 : 0);
 }
+
+// A cluster whose chord iteration fails is left to Newton's (newton.cc), which is there once the host has seen that there are such.
+#define NOTE_UNSOLVED failure[2] = 1;
 
 /** The second half of a step for every stride-th piece; see finishStep. */
 inline DEVICE void finishPieces(int piece, int numPieces, int stride, LargeTask task, GLOBAL mixed* RESTRICT partials, int numPartials, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS,
@@ -851,8 +855,10 @@ inline DEVICE void tryPieces(int piece, int numPieces, int stride, LargeTask tas
             sums[j] = halfSums[j] = 0;
         const int completed = runPiece(TRY, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, 0, 0, sums, halfSums, memory, flags);
         const bool hasFailed = (isLast && (completed & 4) != 0);
-        if (THREAD == 0 && hasFailed)
+        if (THREAD == 0 && hasFailed) {
             sums[FAILURES] += 1;
+            NOTE_UNSOLVED
+        }
         MERGE_SUMS(sums);
         if (THREAD == 0 && ((completed & 1) != 0 || hasFailed))
             for (int j = 0; j < NUM_SUMS; j++)
@@ -868,8 +874,11 @@ inline DEVICE void advancePieces(int piece, int numPieces, int stride, LargeTask
     mixed sums[NUM_SUMS], halfSums[NUM_SUMS];
     KEEP_LOOP for (; piece < numPieces; piece += stride) {
         const int completed = runPiece(ADVANCE, piece, task, LARGE_ARGUMENTS, LARGE_STATE_ARGUMENTS, oldPositions, oldVelocities, sums, halfSums, memory, flags NOISE_ARGUMENTS);
-        if (THREAD == 0 && isLast && (completed & 4) != 0)
-            fail(failure, task.step, NOT_CONVERGED + NUM_CODES*piece);
+        if (THREAD == 0 && isLast && (completed & 4) != 0) {
+            NOTE_UNSOLVED
+            if (!HAS_NEWTON)
+                fail(failure, task.step, NOT_CONVERGED + NUM_CODES*piece);
+        }
     }
 }
 
@@ -942,11 +951,9 @@ KERNEL void tryLarge(int step, int firstStage, int endStage, int isLast, int sta
 KERNEL void advanceLarge(int step, int firstStage, int endStage, int isLast, int stamp, mixed tolerance, GLOBAL const wide* RESTRICT nextControl, GLOBAL mixed4* RESTRICT oldPositions,
         GLOBAL mixed4* RESTRICT oldVelocities, int numPieces, LARGE_STATE_PARAMETERS, LARGE_PARAMETERS LARGE_NOISE_STATE) {
     LARGE_MEMORY
-    // Only what earlier launches have written may decide, or the groups of one cluster would not agree: this one writes other codes.
-    const bool isFrozen = (IS_FROZEN(failure, step) || (failure[0] == step && failure[1]%NUM_CODES == UNSOLVED_DENSITY));
     const mixed dt = (mixed) nextControl[STEP_SIZE];
     const LargeTask task = makeTask(step, firstStage, endStage, stamp, dt/2, UPDATE == LANGEVIN ? dt/2 : dt, tolerance);
-    advancePieces(isFrozen ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags NOISE_ARGUMENTS);
+    advancePieces(HAS_NO_STEP(failure, step) ? numPieces : GROUP_ID, numPieces, NUM_GROUPS, task, isLast, oldPositions, oldVelocities, LARGE_STATE_ARGUMENTS, LARGE_ARGUMENTS, memory, flags NOISE_ARGUMENTS);
 }
 
 #endif

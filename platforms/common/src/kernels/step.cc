@@ -221,6 +221,9 @@ inline DEVICE void enterStep(wide rho, wide u, wide maxStep, wide* now, GLOBAL c
 // A failure is written down as the number of its step and a code, and from then on no launch of a later step does anything. The
 // launches of the same step may see it come or not: what they write is put back. Of two the first counts.
 #define IS_FROZEN(failure, step) ((failure)[0] != 0 && (failure)[0] != (step))
+// The same behind advanceStep(), which may have found that there is no such step. Only what earlier launches have written may decide, or
+// groups would not agree.
+#define HAS_NO_STEP(failure, step) (IS_FROZEN(failure, step) || ((failure)[0] == (step) && (failure)[1]%NUM_CODES == UNSOLVED_DENSITY))
 
 inline DEVICE void fail(GLOBAL int* RESTRICT failure, int step, int code) {
     if (failure[0] == 0) {
