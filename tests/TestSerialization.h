@@ -374,7 +374,7 @@ inline void testRefusedCheckpoints() {
     ASSERT(start != std::string::npos);
     std::string newer = checkpoint, damaged = checkpoint;
     newer[start + 8] = 9;
-    assertThrows("version 9 of its format and this plugin reads version 5",
+    assertThrows("version 9 of its format and this plugin reads version 6",
                  [&] { loadCheckpoint(run.context, newer); });
     damaged[damaged.size() - 100] ^= 1;
     assertThrows("damaged", [&] { loadCheckpoint(run.context, damaged); });
@@ -559,8 +559,8 @@ inline void testRefusedStates() {
         target.context.setState(stateFromXml(replaced(xml, from, to)));
     };
     const std::string version = "integrator=\"VariableStepRattleIntegrator\" version=\"";
-    assertThrows("version 4 of their format and this plugin reads version 2",
-                 [&] { load(version + "2", version + "4"); });
+    assertThrows("version 4 of their format and this plugin reads version 3",
+                 [&] { load(version + "3", version + "4"); });
     assertThrows("damaged", [&] { load("<Value v=", "<Value v=\"1\"/><Value v="); });
     assertThrows("damaged", [&] { load("<Forces>", "<Forces><Vector x=\"0\" y=\"0\" z=\"0\"/>"); });
     ASSERT_EQUAL(0.001, other.getNominalStepSize());

@@ -194,7 +194,8 @@ public:
             margin; // the fraction of the tolerance that is aimed at; where rounding forbids it, the tolerance itself will do
     };
     /**
-     * Solve g(q+) = 0 (3.11), by chord iterations with K(q), and where they fail by Newton's. There is at least one update.
+     * Solve g(q+) = 0 (3.11), by iterations with one matrix, and where they fail by Newton's: K(q), or in batches
+     * Newton's at the guess. There is at least one update.
      *
      * @return whether it is solved; if not, explainFailure() says what is in the way
      */

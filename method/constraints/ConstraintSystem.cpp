@@ -411,5 +411,6 @@ double ConstraintSystem::getExpressionMultiplier(int expression, const vector<do
     const auto isWanted = [&](const ExpressionRow& row) {
         return givenIndex[row.constraint] == numGivenDistances + expression;
     };
-    return multipliers[std::find_if(expressionRows.begin(), expressionRows.end(), isWanted)->constraint];
+    const int k = std::find_if(expressionRows.begin(), expressionRows.end(), isWanted)->constraint;
+    return multipliers[k] * multiplierFactors[k];
 }

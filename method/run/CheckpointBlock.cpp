@@ -16,8 +16,9 @@ using std::string;
 namespace {
 
 const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
-// 2: fingerprints of box and parameters, no force groups; 3: parameters of expressions; 4: random numbers; 5: temperature of references
-const int VERSION = 5;
+// 2: fingerprints of box and parameters, no force groups; 3: parameters of expressions; 4: random numbers; 5: temperature of references;
+// 6: another order of constraints, no u. What a run holds of constraints is in the order of ConstraintLayout: a change there is one here.
+const int VERSION = 6;
 const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
 
 unsigned long long fingerprintOf(const string& data) {

@@ -154,7 +154,7 @@ void HostVRattleDevice::saveMethod(RunState& run) {
 
 void HostVRattleDevice::read(const RunState& run, const IntegratorSettings& saved, StepState& state,
                              VRattleRun::Memory& memory) const {
-    exchange(state, memory, RunState::Archive(run), saved.monitors.size(), saved.isAutomatic);
+    exchange(state, memory, RunState::Archive(run), saved.isAutomatic ? 0 : saved.monitors.size(), saved.isAutomatic);
     const vector<double>& rates = state.theta.rates;
     state.theta.isMoving = std::any_of(rates.begin(), rates.end(), [](double rate) { return rate != 0; });
     state.w = run.halfStepVelocities;

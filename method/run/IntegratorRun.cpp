@@ -295,16 +295,20 @@ void IntegratorRun::reverse() {
     toldDensity.reset();
 }
 
+std::function<void()> IntegratorRun::keepTask() {
+    return [this, before = task] { task = before; };
+}
+
 void IntegratorRun::replaceVelocities(const std::function<void()>& set, const std::function<void()>& putBack) {
     findTask(false, false);
-    const Task before = task;
+    const auto takeBack = keepTask();
     try {
         set();
         fulfilTask();
     }
     catch (...) {
         putBack();
-        task = before; // whatever has been announced, all is as it was
+        takeBack();
         throw;
     }
     device.writeVelocities();

@@ -45,6 +45,8 @@ public:
     void step(int count);
     void stepTo(double time);
     void reverse();
+    /** What takes back all that will have been announced since: for changes of the Context that are undone. */
+    std::function<void()> keepTask();
     /**
      * Let the Context have other velocities, and move them onto the constraints as a start does. Where no run can start with them,
      * all is as before.

@@ -344,7 +344,8 @@ LangevinDynamics::Noise LangevinDynamics::findNoise() const {
 
 // v <- a v + sqrt(kT (1 - a^2)) M^-1/2 xi. The numbers xi are those of the step, whatever attempt asks for them.
 void LangevinDynamics::addNoise(const int* particles, int count, Vectors& velocities) const {
-    const double a = findNoise().damping, s = findNoise().size;
+    const Noise noise = findNoise();
+    const double a = noise.damping, s = noise.size;
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
     Vec3 numbers[RandomNumbers::BLOCK];
     for (int first = 0; first < count && a != 1; first += RandomNumbers::BLOCK) {

@@ -16,6 +16,7 @@
 #include "run/IntegratorRun.h"
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <memory>
 #include <sstream>
 
@@ -31,8 +32,8 @@ using std::vector;
 
 namespace {
 
-// Of the parameters that States hold; the settings among them have a version of their own.
-const int PARAMETERS_VERSION = 2;
+// Of the parameters that States hold, among them the saved run (see CheckpointBlock); the settings have a version of their own.
+const int PARAMETERS_VERSION = 3;
 // Its square, by which multipliers act on positions, must not vanish.
 const double SMALLEST_STEP_SIZE = 1e-100;
 
@@ -270,21 +271,22 @@ IntegratorRun& ConstrainedIntegrator::requireRun() const {
     return *run;
 }
 
-// Other members of a CompoundIntegrator that have loaded a saved run know it by the particles' places, which are about to change.
-IntegratorRun& ConstrainedIntegrator::requireRunForStep() {
-    IntegratorRun& own = requireRun();
+vector<IntegratorRun*> ConstrainedIntegrator::getOtherRuns() const {
+    vector<IntegratorRun*> runs;
     auto* all = dynamic_cast<OpenMM::CompoundIntegrator*>(&context->getIntegrator());
     for (int i = 0; all != nullptr && i < all->getNumIntegrators(); i++) {
         auto* other = dynamic_cast<ConstrainedIntegrator*>(&all->getIntegrator(i));
-        if (other == nullptr || other == this || other->run == nullptr)
-            continue;
-        try {
-            other->run->takeSaved();
-        }
-        catch (const OpenMMException&) {
-            // which is a matter of its own step
-        }
+        if (other != nullptr && other != this && other->run != nullptr)
+            runs.push_back(other->run.get());
     }
+    return runs;
+}
+
+// Others that have loaded a saved run know it by the particles' places, which are about to change.
+IntegratorRun& ConstrainedIntegrator::requireRunForStep() {
+    IntegratorRun& own = requireRun();
+    for (IntegratorRun* other : getOtherRuns())
+        other->takeSaved();
     return own;
 }
 
@@ -303,9 +305,16 @@ void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int r
     }
     vector<OpenMM::Vec3> before;
     context->getVelocities(before);
+    vector<std::function<void()>> takeBack;
+    for (IntegratorRun* other : getOtherRuns())
+        takeBack.push_back(other->keepTask());
     inContext.replaceVelocities(
         [&] { context->setVelocities(drawMaxwellVelocities(context->getSystem(), temperature, randomSeed)); },
-        [&] { context->setVelocities(before); });
+        [&] {
+            context->setVelocities(before);
+            for (const auto& each : takeBack)
+                each();
+        });
 }
 
 void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {

@@ -105,3 +105,35 @@ def test_multipliers_in_double_precision_are_those_of_reference() -> None:
     assert np.max(np.abs(here - forces)) < 1e-10 * np.max(np.abs(forces))
     # The monitor is the norm of the multipliers, which the device computes itself.
     np.testing.assert_allclose(values, expected, rtol=1e-10)
+
+
+def turning_zigzag(platform: str, steps_at_once: int) -> tuple[np.ndarray, list[bool]]:
+    """A zigzag of 24 bonds that turn by up to half a radian in a step: the chord iteration does not contract there."""
+    system = openmm.System()
+    places = np.arange(25)
+    for place in places:
+        system.addParticle(12.0)
+        if place > 0:
+            system.addConstraint(place - 1, place, 0.15)
+    integrator = VariableStepRattleIntegrator(0.001, constraintTolerance=1e-10)
+    integrator.clearMonitors()
+    context = make_context(system, integrator, platform)
+    velocities = np.zeros((25, 3))
+    velocities[1:, 2] = np.where(places[1:] % 4 < 2, 31.0, -31.0)
+    context.setPositions(np.stack([0.12 * (places - 12), 0.09 * (places % 2), 0.0 * places], axis=1))
+    context.setVelocities(velocities)
+    are_on_device = []
+    for _ in range(4 // steps_at_once):
+        integrator.step(steps_at_once)
+        are_on_device.append(integrator.isOnDevice())
+    assert context.getStepCount() == 4
+    return context.getState(positions=True).getPositions(asNumpy=True)._value, are_on_device
+
+
+@pytest.mark.parametrize("steps_at_once", [1, 4])
+def test_newtons_iteration_of_a_large_cluster_is_the_devices(steps_at_once: int) -> None:
+    """The start is the host's; the steps after it stay on the device, those that it takes again among them."""
+    expected, _ = turning_zigzag("Reference", 1)
+    positions, are_on_device = turning_zigzag("OpenCL:double", steps_at_once)
+    assert are_on_device == ([False, True, True, True] if steps_at_once == 1 else [True])
+    np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-9)

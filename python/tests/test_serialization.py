@@ -458,8 +458,8 @@ def test_a_checkpoint_of_something_else_is_refused(water: TestSystem, molecule: 
         open_test_context(molecule, make_integrator()).loadCheckpoint(checkpoint)
     # A number after the mark says which version of the format it is.
     mark = checkpoint.index(b"VRATTLE\n") + 8
-    newer = checkpoint[:mark] + (6).to_bytes(4, sys.byteorder) + checkpoint[mark + 4 :]
-    with pytest.raises(openmm.OpenMMException, match="version 6 of its format and this plugin reads version 5"):
+    newer = checkpoint[:mark] + (7).to_bytes(4, sys.byteorder) + checkpoint[mark + 4 :]
+    with pytest.raises(openmm.OpenMMException, match="version 7 of its format and this plugin reads version 6"):
         context.loadCheckpoint(newer)
     for end in (mark - 3, mark + 2, mark + 10, mark + 30, len(checkpoint) - 1):
         with pytest.raises(openmm.OpenMMException, match="OpenMM-VRATTLE: this checkpoint"):
@@ -532,10 +532,10 @@ def test_a_state_of_another_kind_is_refused(water: TestSystem) -> None:
     state = context.getState(positions=True, velocities=True, integratorParameters=True)
     xml = openmm.XmlSerializer.serialize(state)
     newer = xml.replace(
-        'integrator="VariableStepRattleIntegrator" version="2"', 'integrator="VariableStepRattleIntegrator" version="4"'
+        'integrator="VariableStepRattleIntegrator" version="3"', 'integrator="VariableStepRattleIntegrator" version="4"'
     )
     assert newer != xml
-    with pytest.raises(openmm.OpenMMException, match="version 4 of their format and this plugin reads version 2"):
+    with pytest.raises(openmm.OpenMMException, match="version 4 of their format and this plugin reads version 3"):
         context.setState(openmm.XmlSerializer.deserialize(newer))
     verlet = open_test_context(water, openmm.VerletIntegrator(STEP))
     verlet.setState(context.getState(positions=True, velocities=True, integratorParameters=True))

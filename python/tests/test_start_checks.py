@@ -120,6 +120,28 @@ def test_velocities_that_are_refused_leave_no_trace(platform: str) -> None:
     assert abs(ends[0][1] - ends[1][1]) <= allowed
 
 
+def test_velocities_that_are_refused_leave_no_trace_in_other_integrators() -> None:
+    """Those of the same CompoundIntegrator were told of new velocities, too."""
+    model = waters()
+    ends = []
+    for is_asked in (False, True):
+        compound, members = openmm.CompoundIntegrator(), []
+        for _ in range(2):
+            members.append(VariableStepRattleIntegrator(0.0005))
+            compound.addIntegrator(members[-1])
+        context = open_context(model.system(), compound, model.positions)
+        context.setVelocities(model.velocities)
+        for turn in range(4):
+            compound.setCurrentIntegrator(turn % 2)
+            if is_asked and turn == 2:
+                with pytest.raises(openmm.OpenMMException, match="faster than light"):
+                    members[0].setVelocitiesToTemperature(1e30, 1)
+            compound.step(6)
+        ends.append((positions_of(context), [member.getStepDensity() for member in members]))
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    assert ends[0][1] == ends[1][1]
+
+
 def test_three_particles_in_a_line() -> None:
     integrator = VariableStepRattleIntegrator(0.001)
     with pytest.raises(ValueError, match=r"x2 - 0.5\*\(x1\+x3\).*docs/constraints.md, molecules in a line"):

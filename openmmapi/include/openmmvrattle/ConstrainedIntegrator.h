@@ -194,6 +194,8 @@ protected:
     std::unique_ptr<IntegratorRun> run; // in the Context, as long as there is one
 
 private:
+    /** The runs of the other integrators of this package in the same CompoundIntegrator. */
+    std::vector<IntegratorRun*> getOtherRuns() const;
     ConstrainedIntegrator(const ConstrainedIntegrator&) = delete;
     ConstrainedIntegrator& operator=(const ConstrainedIntegrator&) = delete;
     std::string getName() const;

@@ -472,6 +472,6 @@ void StepProgram::writeExpressions(const ExpressionClusters* expressions, const 
     defines["PART_TERMS"] = to_string(ExpressionClusters::NUM_TERMS);
     defines["MAX_PART_ITERATIONS"] = to_string(MAX_PART_ITERATIONS);
     defines["SUDDEN_CHANGE"] = to_string(ParameterMotion::SUDDEN_CHANGE) + "f";
-    defines["SMALL_JUMP"] = to_string(MonitorControl::SMALL_CHANGE) + "f";
-    defines["SMALL_JUMP_OF_ENERGY"] = literal(ParameterMotion::SMALL_JUMP) + "f";
+    defines["SMALL_CHANGE"] = to_string(MonitorControl::SMALL_CHANGE) + "f";
+    defines["SMALL_JUMP"] = literal(ParameterMotion::SMALL_JUMP) + "f";
 }

@@ -115,10 +115,10 @@ KERNEL void judgeJump(int step, wide groupEnergy, int numPartials, GLOBAL wide* 
     if (LOCAL_ID == 0) {
 #if UPDATE == AUTOMATIC
         const wide before = sums[SUM_KINETIC], after = before + (wide) jumpSums[SUM_KINETIC];
-        control[IS_JUMP_AHEAD] = (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && jumpSums[SUM_CHANGE] > (wide) SMALL_JUMP_OF_ENERGY*max(before, after) ? 1 : 0);
+        control[IS_JUMP_AHEAD] = (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && jumpSums[SUM_CHANGE] > (wide) SMALL_JUMP*max(before, after) ? 1 : 0);
 #else
         const wide u = evaluateMonitors(sums, groupEnergy, settings, values), next = evaluateMonitors(jumpSums, groupEnergy, settings, values);
-        if (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && u > 0 && next > 0 && next < (wide) 1e37f && fabs(next/u - 1) > (wide) SMALL_JUMP)
+        if (!IS_FROZEN(failure, step) && hasJumped[0] != 0 && u > 0 && next > 0 && next < (wide) 1e37f && fabs(next/u - 1) > (wide) SMALL_CHANGE)
             control[DENSITY_SCALE] = next/u;
 #endif
         hasJumped[0] = 0;
