@@ -235,6 +235,7 @@ def integrators(step: float, state: openmm.State, system: openmm.System, single:
         "Explicit": with_tolerance(lambda: ours(step, ours.Explicit), tolerance),
         "Bounded": with_tolerance(lambda: ours(step, ours.Bounded), tolerance),
         "SemiExplicit": with_tolerance(lambda: ours(step), tolerance),
+        "automatic": with_tolerance(lambda: ours(step, automatic=True), tolerance),
         "custom": with_tolerance(lambda: custom(step, monitors=[custom.ConstraintAndAppliedForce]), coarse),
     }
 

@@ -12,13 +12,13 @@ os.environ.setdefault("OPENMM_DEFAULT_PLATFORM", "CPU")
 
 import openmm  # noqa: E402
 import pytest  # noqa: E402
+from run_support import GPU, PRESENT  # noqa: E402
 
-# OpenCL is tested in double precision and with these files alone, for PoCL takes seconds to compile; the C++ tests tell
-# most of it. (OpenMM's own constraint solver and its minimiser, which other files use, fail there.)
-ON_OPENCL = ("test_step_to", "test_reversibility")
-PRESENT = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
-if "OpenCL" in PRESENT:
-    openmm.Platform.getPlatform("OpenCL").setPropertyDefaultValue("Precision", "double")
+# GPUs are tested in double precision and with these files alone, for PoCL takes seconds to compile; the C++ tests tell
+# most of it. (OpenMM's own constraint solver and its minimiser, which other files use, fail with PoCL.)
+ON_GPU = ("test_step_to", "test_reversibility")
+if GPU in PRESENT:
+    openmm.Platform.getPlatform(GPU).setPropertyDefaultValue("Precision", "double")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -26,8 +26,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     says_itself = any("platform" in str(mark.args[0]) for mark in metafunc.definition.iter_markers("parametrize"))
     if "platform" in metafunc.fixturenames and not says_itself:
         names = ["Reference", "CPU"]
-        if metafunc.module.__name__ in ON_OPENCL and "OpenCL" in PRESENT:
-            names.append("OpenCL")
+        if metafunc.module.__name__ in ON_GPU and GPU in PRESENT:
+            names.append(GPU)
         metafunc.parametrize("platform", names, indirect=True)
 
 

@@ -13,10 +13,10 @@ from openmm import app, unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import constraint_error
 
-needs_opencl = pytest.mark.skipif(
-    "OpenCL" not in {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())},
-    reason="this OpenMM has no platform OpenCL",
-)
+PRESENT = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
+# A real GPU where there is one, or else OpenCL on the processor.
+GPU = next((name for name in ("CUDA", "HIP", "OpenCL") if name in PRESENT), "OpenCL")
+needs_gpu = pytest.mark.skipif(GPU not in PRESENT, reason="this OpenMM has no GPU platform")
 BOLTZMANN = 0.00831446261815324
 FORCE_MONITOR = "ConstraintAndAppliedForce"
 
@@ -50,8 +50,7 @@ def add_thermostat_and_trap(system: openmm.System, frequency: float) -> None:
 
 def fastest_platform() -> str:
     """CPU where there is one: for tests too slow on Reference."""
-    names = {openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())}
-    return "CPU" if "CPU" in names else "Reference"
+    return "CPU" if "CPU" in PRESENT else "Reference"
 
 
 def solvated(model: str = "tip3p", count: int = 60, shape: str = "cube") -> tuple[app.Modeller, app.ForceField]:

@@ -11,18 +11,16 @@ import pytest
 from dense_reference import Array
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import TestSystem, light_heavy_chain, nitrogen_collision, water_clash
+from run_support import GPU, needs_gpu
 
-GPU_PLATFORMS = [
-    name
-    for name in ("OpenCL", "CUDA", "HIP")
-    if name in [openmm.Platform.getPlatform(i).getName() for i in range(openmm.Platform.getNumPlatforms())]
-]
+pytestmark = needs_gpu
+
 STATE = {"positions": True, "velocities": True, "parameters": True, "integratorParameters": True}
 
 
 def open_run(case: TestSystem, platform: str, step: float) -> openmm.Context:
     integrator = VariableStepRattleIntegrator(step, automatic=True, constraintTolerance=1e-12)
-    properties = {"Precision": "double"} if platform in GPU_PLATFORMS else {}
+    properties = {"Precision": "double"} if platform == GPU else {}
     context = openmm.Context(case.system, integrator, openmm.Platform.getPlatform(platform), properties)
     context.setPositions(case.positions)
     context.setVelocities(case.velocities)
@@ -48,16 +46,15 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("platform", GPU_PLATFORMS or [pytest.param("OpenCL", marks=pytest.mark.skip("no GPU"))])
 @pytest.mark.parametrize("name", CASES)
-def test_the_steps_are_those_of_reference(name: str, platform: str) -> None:
+def test_the_steps_are_those_of_reference(name: str) -> None:
     """From a State in mid-run: positions, step sizes and monitors, after one step and after some hundred.
 
     So the energy error, and with it the gain over fixed steps, is the same.
     """
     make, step, before, steps, bound = CASES[name]
     case = make()
-    there, here = open_run(case, "Reference", step), open_run(case, platform, step)
+    there, here = open_run(case, "Reference", step), open_run(case, GPU, step)
     there.getIntegrator().step(before)
     here.setState(there.getState(**STATE))
     energy = energy_of(there)
@@ -83,12 +80,11 @@ def test_the_steps_are_those_of_reference(name: str, platform: str) -> None:
     assert ours.getNumForceEvaluations() == steps // 10 * 10 + 2
 
 
-@pytest.mark.parametrize("platform", GPU_PLATFORMS or [pytest.param("OpenCL", marks=pytest.mark.skip("no GPU"))])
-def test_a_run_moves_between_platforms_and_comes_back(platform: str) -> None:
+def test_a_run_moves_between_platforms_and_comes_back() -> None:
     """A State goes to the GPU and back, there time is turned around, and all ends where it was before."""
     case = nitrogen_collision()
     make: Callable[[str], openmm.Context] = lambda on: open_run(case, on, 2e-3)  # noqa: E731
-    runs = [make(on) for on in ("Reference", platform, "Reference", platform)]
+    runs = [make(on) for on in ("Reference", GPU, "Reference", GPU)]
     start = None
     for last, run in zip([None, *runs[:-1]], runs, strict=True):
         if last is not None:

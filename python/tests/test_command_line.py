@@ -30,7 +30,7 @@ from openmmvrattle.testsystems import (
     rigid_waters,
 )
 from project_scripts import run_command
-from run_support import needs_opencl, solvated
+from run_support import GPU, needs_gpu, solvated
 
 
 def save(start: TestSystem, folder: Path, velocities: bool = True, positions: bool = True) -> tuple[Path, Path]:
@@ -353,19 +353,19 @@ def test_advise_on_a_system_and_state(tmp_path: Path) -> None:
     assert max(abs(energy - energies[0]) for energy in energies) < 1e-3
 
 
-@needs_opencl
+@needs_gpu
 def test_advise_and_compare_run_on_a_platform_by_name(tmp_path: Path) -> None:
     """In any case of its letters, and with a precision."""
-    common = ("--system", "water-clash", "--platform", "opencl", "--precision", "double")
+    common = ("--system", "water-clash", "--platform", GPU.lower(), "--precision", "double")
     result = run_command("advise", *common)
     assert result.returncode == 0, result.stderr
-    assert "platform OpenCL:double" in result.stdout
+    assert f"platform {GPU}:double" in result.stdout
     assert "Use variable steps: ForcePNorm^0.5" in result.stdout
     result = run_command("compare", *common, "--integrators", "RATTLE", "Automatic", "--output", str(tmp_path))
     assert result.returncode == 0, result.stderr
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["platform"] for row in rows] == ["OpenCL:double"] * 2
+    assert [row["platform"] for row in rows] == [f"{GPU}:double"] * 2
     fixed, automatic = (float(row["largest_energy_error"]) for row in rows)
     assert fixed > 20 * automatic  # 100 times on Reference
 

@@ -11,15 +11,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from run_support import needs_opencl
+from run_support import GPU, needs_gpu
 
 FOLDER = Path(__file__).parents[2] / "examples"
 
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="needs the folder examples")
 
 
-ON_OPENCL = ["--platform", "OpenCL", "--precision", "double"]
-everywhere = pytest.mark.parametrize("options", [[], pytest.param(ON_OPENCL, marks=needs_opencl)], ids=["", "OpenCL"])
+ON_GPU = ["--platform", GPU, "--precision", "double"]
+everywhere = pytest.mark.parametrize("options", [[], pytest.param(ON_GPU, marks=needs_gpu)], ids=["", "GPU"])
 
 
 def run(name: str, folder: Path, options: list[str] | None = None) -> str:
@@ -98,10 +98,10 @@ def test_no_minimisation(tmp_path: Path) -> None:
     assert "failed" in theirs or float(theirs.split()[-1]) > 400
 
 
-@needs_opencl
+@needs_gpu
 @pytest.mark.parametrize("name", ["pulled_chain", "blue_moon"])
 def test_those_with_files_of_their_own_run_on_a_platform_by_name(name: str, tmp_path: Path) -> None:
-    output = run(f"{name}.py", tmp_path, ON_OPENCL)
+    output = run(f"{name}.py", tmp_path, ON_GPU)
     if name == "pulled_chain":
         assert float(re.search(r"largest relative difference: (\S+)", output)[1]) < 1e-9
     else:

@@ -1,6 +1,6 @@
 # OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 # SPDX-License-Identifier: MIT
-"""The precision of a device: what it allows, and what double precision is good for. On OpenCL."""
+"""The precision of a device: what it allows, and what double precision is good for."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.platforms import make_context
 from openmmvrattle.testsystems import constraint_error, project_onto_constraints
-from run_support import needs_opencl
+from run_support import GPU, needs_gpu
 
-pytestmark = needs_opencl
+pytestmark = needs_gpu
 
 TOLERANCES = """
 import sys
@@ -29,7 +29,7 @@ waters = rigid_waters(4)
 for _ in range(2):
     integrator = VariableStepRattleIntegrator(0.001)
     integrator.setConstraintTolerance(float(sys.argv[2]))
-    context = make_context(waters.system, integrator, f"OpenCL:{sys.argv[1]}")
+    context = make_context(waters.system, integrator, f"{sys.argv[3]}:{sys.argv[1]}")
     context.setPositions(waters.positions)
     context.setVelocities(waters.velocities)
     integrator.step(20)
@@ -47,7 +47,7 @@ for _ in range(2):
 def test_a_tolerance_that_cannot_be_met_is_raised(precision: str, tolerance: str, floor: str | None) -> None:
     """It is said once in a process, on the standard error, and the constraints are met to what is used."""
     result = subprocess.run(
-        [sys.executable, "-c", TOLERANCES, precision, tolerance], check=True, capture_output=True, text=True
+        [sys.executable, "-c", TOLERANCES, precision, tolerance, GPU], check=True, capture_output=True, text=True
     )
     said = [line for line in result.stderr.splitlines() if "constraint tolerance" in line]
     words = f"{float(tolerance):g} is below what the precision of this Context allows; {floor} is used"
@@ -87,7 +87,7 @@ def test_multipliers_in_double_precision_are_those_of_reference() -> None:
     system.addForce(springs)
     positions, velocities = project_onto_constraints(system, positions, random.normal(size=(beads, 3)))
     found = {}
-    for name in ("Reference", "OpenCL:double"):
+    for name in ("Reference", f"{GPU}:double"):
         integrator = VariableStepRattleIntegrator(0.0005)
         integrator.setConstraintTolerance(1e-12)
         context = make_context(system, integrator, name)
@@ -134,6 +134,6 @@ def turning_zigzag(platform: str, steps_at_once: int) -> tuple[np.ndarray, list[
 def test_newtons_iteration_of_a_large_cluster_is_the_devices(steps_at_once: int) -> None:
     """The start is the host's; the steps after it stay on the device, those that it takes again among them."""
     expected, _ = turning_zigzag("Reference", 1)
-    positions, are_on_device = turning_zigzag("OpenCL:double", steps_at_once)
+    positions, are_on_device = turning_zigzag(f"{GPU}:double", steps_at_once)
     assert are_on_device == ([False, True, True, True] if steps_at_once == 1 else [True])
     np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-9)

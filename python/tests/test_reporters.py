@@ -23,7 +23,7 @@ from openmmvrattle import (
 from openmmvrattle.platforms import platform_and_properties
 from openmmvrattle.reporters import StepSizeReporter, run_for_time
 from openmmvrattle.testsystems import constraint_error, light_heavy_chain, rigid_waters
-from run_support import needs_opencl
+from run_support import GPU, needs_gpu
 
 HEADINGS = [
     "Step",
@@ -111,11 +111,11 @@ def test_every_column_is_what_the_integrator_and_the_state_say() -> None:
     assert len(read(output.getvalue())) == 3
 
 
-@needs_opencl
+@needs_gpu
 def test_reports_on_a_device() -> None:
     """On a platform by name: the columns are those of Reference, at the same times and at equal ones."""
     rows = {}
-    for name in ("Reference", "OpenCL:double"):
+    for name in ("Reference", f"{GPU}:double"):
         waters, output = rigid_waters(4), io.StringIO()
         simulation = app.Simulation(waters.topology, waters.system, our_integrator(), *platform_and_properties(name))
         simulation.context.setPositions(waters.positions)

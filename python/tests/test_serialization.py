@@ -19,7 +19,7 @@ from dense_reference import open_context, positions_of, time_of, value, velociti
 from openmm import app
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.testsystems import TestSystem, alanine_dipeptide, rigid_waters
-from run_support import needs_opencl
+from run_support import GPU, needs_gpu
 
 pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
 
@@ -332,7 +332,7 @@ def test_a_checkpoint_on_every_platform(water: TestSystem, platform: str) -> Non
 
 
 @pytest.mark.parametrize("is_set", [False, True])
-@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+@pytest.mark.parametrize("platform", ["Reference", pytest.param(GPU, marks=needs_gpu)])
 def test_a_checkpoint_where_forces_are_no_numbers(platform: str, is_set: bool) -> None:
     """It can be written; what was loaded from it runs as soon as the forces are numbers again."""
     system = openmm.System()
@@ -345,7 +345,7 @@ def test_a_checkpoint_where_forces_are_no_numbers(platform: str, is_set: bool) -
 
     def open_here() -> tuple[openmm.Context, VariableStepRattleIntegrator]:
         integrator = VariableStepRattleIntegrator(0.001, monitors=[VariableStepRattleIntegrator.AppliedForce])
-        properties = {"Precision": "double"} if platform == "OpenCL" else {}
+        properties = {"Precision": "double"} if platform == GPU else {}
         context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
         context.setPositions([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
         return context, integrator
@@ -368,7 +368,7 @@ def test_a_checkpoint_where_forces_are_no_numbers(platform: str, is_set: bool) -
 
 
 @pytest.mark.parametrize("is_set", [False, True])
-@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+@pytest.mark.parametrize("platform", ["Reference", pytest.param(GPU, marks=needs_gpu)])
 def test_a_checkpoint_after_a_parameter_has_changed(platform: str, is_set: bool) -> None:
     """The density is scaled with u, also where somebody has computed the new forces before, or changes a setting."""
     system = openmm.System()
@@ -383,7 +383,7 @@ def test_a_checkpoint_after_a_parameter_has_changed(platform: str, is_set: bool)
     def open_here() -> tuple[openmm.Context, VariableStepRattleIntegrator]:
         monitors = [VariableStepRattleIntegrator.AppliedForce]
         integrator = VariableStepRattleIntegrator(0.002, VariableStepRattleIntegrator.Explicit, 0, 0, monitors=monitors)
-        properties = {"Precision": "double"} if platform == "OpenCL" else {}
+        properties = {"Precision": "double"} if platform == GPU else {}
         context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
         context.setPositions([[1.0, 1, 1.1], [1.1, 1, 1.1], [1.3, 0.8, 1]])
         return context, integrator

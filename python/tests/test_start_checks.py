@@ -12,7 +12,7 @@ import pytest
 from dense_reference import positions_of, waters
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator, constraints, testsystems
-from run_support import needs_opencl
+from run_support import GPU, needs_gpu
 
 KB = 0.00831446261815324
 """Boltzmann's constant in kJ/mol/K."""
@@ -98,7 +98,7 @@ def test_seeds_and_arguments() -> None:
         integrator.setVelocitiesToTemperature(-300)
 
 
-@pytest.mark.parametrize("platform", ["Reference", pytest.param("OpenCL", marks=needs_opencl)])
+@pytest.mark.parametrize("platform", ["Reference", pytest.param(GPU, marks=needs_gpu)])
 def test_velocities_that_are_refused_leave_no_trace(platform: str) -> None:
     """The run goes on with its density, as if they had never been asked for; on a GPU too, where it had stepped."""
     model = waters()

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 // The tests of `tests` on a GPU platform. The program's arguments are its name, our library for it and a precision; then perhaps
-// the number of one test.
+// the number of one test, or the word `count`, to print how many there are.
 
 #include "ReferenceVRattleKernelFactory.h"
 #include "TestSupport.h"
@@ -30,8 +30,12 @@ inline std::string withoutNumbers(const std::string& text) {
 }
 
 inline int runOnPlatform(const TestList& tests, int argc, char** argv) {
+    if (argc > 4 && std::string(argv[4]) == "count") {
+        std::cout << tests.size() << std::endl;
+        return 0;
+    }
     if (argc < 4) {
-        std::cerr << argv[0] << " <platform> <library> <precision> [<test>]" << std::endl;
+        std::cerr << argv[0] << " <platform> <library> <precision> [<test> | count]" << std::endl;
         return 2;
     }
     testPlatformName() = argv[1];
