@@ -4,11 +4,11 @@
 #include "run/HostRunDevice.h"
 #include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
-#include "run/HostLangevinDevice.h"
-#include "run/HostVRattleDevice.h"
 #include "run/IntegratorSettings.h"
+#include "run/LangevinRun.h"
 #include "run/RunState.h"
 #include "run/StartCheck.h"
+#include "run/VRattleRun.h"
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -58,6 +58,14 @@ bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
     return true;
 }
 
+// Whether two vectors differ by no more than this, absolutely or relatively.
+bool isRounding(const Vec3& a, const Vec3& b, double rounding) {
+    for (int d = 0; d < 3; d++)
+        if (!(std::fabs(a[d] - b[d]) <= rounding * std::max(1.0, std::fabs(a[d]))))
+            return false;
+    return true;
+}
+
 vector<double> massesOf(const System& system) {
     vector<double> masses;
     for (int i = 0; i < system.getNumParticles(); i++)
@@ -85,8 +93,8 @@ std::unique_ptr<RunDevice> OpenMMVRattle::makeHostRunDevice(std::unique_ptr<Cont
         return device;
     };
     if (settings.langevin)
-        return make(std::make_unique<HostLangevinDevice>(std::move(vectors), system, settings));
-    return make(std::make_unique<HostVRattleDevice>(std::move(vectors), system, settings));
+        return make(std::make_unique<HostRunDevice<LangevinRun>>(std::move(vectors), system, settings));
+    return make(std::make_unique<HostRunDevice<VRattleRun>>(std::move(vectors), system, settings));
 }
 
 template <class Method>
@@ -105,7 +113,7 @@ HostRunDevice<Method>::HostRunDevice(std::unique_ptr<ContextVectors> vectors, co
 // -------------------------------------------------------------------------------------------------------- the settings
 
 template <class Method> void HostRunDevice<Method>::setSettings(const IntegratorSettings& from) {
-    setMethod(from);
+    method.takeSettings(from);
     forceGroups = from.getActingForceGroups();
     monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
 }
@@ -131,7 +139,7 @@ template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
         return Change::Box;
     // A look at all positions and velocities is spent only where it may find something: where a Force may have changed them, or
     // another integrator (of a CompoundIntegrator) may have taken steps.
-    const bool mustCompare = ahead != nullptr || vectors->isSharedByIntegrators();
+    const bool mustCompare = ahead || vectors->isSharedByIntegrators();
     if ((mustCompare || reach.isUnknown || reach.hasBarostat) && differ(vectors->getPositions(), knownPositions()))
         return Change::State;
     if ((mustCompare || reach.isUnknown || reach.hasBarostat || reach.hasThermostat || reach.movesFrame) &&
@@ -199,7 +207,7 @@ template <class Method> void HostRunDevice<Method>::start() {
         putBackMethod();
         throw;
     }
-    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
+    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
 }
 
 template <class Method> void HostRunDevice<Method>::changeState() {
@@ -207,22 +215,22 @@ template <class Method> void HostRunDevice<Method>::changeState() {
     method.projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
     const double energy = computeForcesAt(positions, forces);
     method.changeState(positions, vectors->getVelocities(), forces, energy);
-    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
+    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
 }
 
 template <class Method> void HostRunDevice<Method>::changeVelocities() {
     const bool isFrame = method.changeFrame(knownVelocities(), vectors->getVelocities());
-    if (isFrame && ahead != nullptr) // somebody has looked between the start and the step
+    if (isFrame && ahead) // somebody has looked between the start and the step
         ahead->velocities = vectors->getVelocities();
     if (isFrame)
         return;
     method.changeVelocities(vectors->getVelocities());
-    ahead.reset(new Ahead{vectors->getPositions(), vectors->getVelocities()});
+    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
 }
 
 template <class Method> void HostRunDevice<Method>::writeVelocities() {
     writeMovingVelocities(method.getVelocities());
-    if (ahead != nullptr)
+    if (ahead)
         ahead->velocities = vectors->getVelocities();
 }
 
@@ -264,19 +272,21 @@ template <class Method> double HostRunDevice<Method>::computeForces() {
 }
 
 template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownPositions() const {
-    return ahead != nullptr ? ahead->positions : method.getPositions();
+    return ahead ? ahead->positions : method.getPositions();
 }
 
 template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownVelocities() const {
-    return ahead != nullptr ? ahead->velocities : method.getVelocities();
+    return ahead ? ahead->velocities : method.getVelocities();
 }
 
-// Particles of mass zero are not the integrator's to move: they are virtual sites, or fixed.
+// Whether two sets of positions or velocities are others than their digits explain, for the particles that move. Those of mass zero
+// are not the integrator's to move: they are virtual sites, or fixed.
 template <class Method> bool HostRunDevice<Method>::differ(const Vectors& a, const Vectors& b) {
+    const double rounding = getPositionRounding();
     std::atomic<bool> areSame(true);
     method.share((int) masses.size(), [&](int first, int end) {
         for (int i = first; i < end && areSame; i++)
-            if (masses[i] > 0 && a[i] != b[i])
+            if (masses[i] > 0 && a[i] != b[i] && !isRounding(a[i], b[i], rounding))
                 areSame = false;
     });
     return !areSame;
@@ -321,11 +331,11 @@ template <class Method> void HostRunDevice<Method>::copyMoving(const Vectors& fr
 // ----------------------------------------------------------------------------------------------------------- the steps
 
 // One step of the method in the Context, the velocities excepted. Forces see the time of its end.
-template <class Method> double HostRunDevice<Method>::advance(double maxTime, double direction) {
+template <class Method> double HostRunDevice<Method>::advance(double maxTime) {
     const double time = vectors->getTime(), maxStep = maxTime - time;
     while (true) {
         const double size = method.step(maxStep);
-        vectors->setTime(size < maxStep ? time + direction * size : maxTime);
+        vectors->setTime(size < maxStep ? time + size : maxTime);
         writeMovingPositions(method.getNextPositions());
         vectors->computeVirtualSites();
         const double energy = computeForces();
@@ -339,7 +349,7 @@ template <class Method> void HostRunDevice<Method>::step(double maxTime) {
     const long long count = vectors->getStepCount();
     try {
         vectors->setStepCount(count + 1);
-        lastStep.size = advance(maxTime, 1);
+        lastStep.size = advance(maxTime);
     }
     catch (...) {
         vectors->setTime(time);
@@ -355,7 +365,7 @@ template <class Method> void HostRunDevice<Method>::step(double maxTime) {
 
 // The positions of the Context before a step.
 template <class Method> void HostRunDevice<Method>::putBack() {
-    if (ahead != nullptr) {
+    if (ahead) {
         vectors->setPositions(ahead->positions);
         return;
     }
@@ -371,8 +381,30 @@ template <class Method> void HostRunDevice<Method>::reverse() {
         if (masses[i] > 0)
             velocities[i] *= -1;
     vectors->setVelocities(velocities);
-    if (ahead != nullptr)
+    if (ahead)
         ahead->velocities = velocities;
+}
+
+template <class Method>
+void HostRunDevice<Method>::tryOut(double stepSize, int count, const std::function<void(const vector<double>&)>& look) {
+    const double time = vectors->getTime();
+    auto end = [&, putBackMethod = method.remember()] {
+        putBackMethod();
+        vectors->setTime(time);
+        putBack();
+    };
+    try {
+        method.beginFixedSteps(stepSize);
+        for (int i = 0; i < count; i++) {
+            advance(std::numeric_limits<double>::infinity());
+            look(method.getMonitorValues());
+        }
+    }
+    catch (...) {
+        end();
+        throw;
+    }
+    end();
 }
 
 // ------------------------------------------------------------------------------------------------------------- numbers
@@ -395,10 +427,16 @@ template <class Method> double HostRunDevice<Method>::computeKineticEnergy() {
     return 0.5 * sum;
 }
 
+template <class Method> double HostRunDevice<Method>::computeHalfStepKineticEnergy() {
+    if constexpr (std::is_same_v<Method, LangevinRun>)
+        return method.computeHalfStepKineticEnergy();
+    return computeKineticEnergy();
+}
+
 // ------------------------------------------------------------------------------------------------- saving and resuming
 
 template <class Method> void HostRunDevice<Method>::save(RunState& run) {
-    saveMethod(run);
+    method.save(run);
     run.methodValues["positionSums"] = sumPositions();
     run.forces = method.getForces();
     run.groupEnergy = method.getGroupEnergy();
@@ -407,10 +445,10 @@ template <class Method> void HostRunDevice<Method>::save(RunState& run) {
         run.positions = method.getPositions();
     if (differ(vectors->getVelocities(), method.getVelocities()))
         run.velocities = method.getVelocities();
-    run.isContextAhead = ahead != nullptr;
-    if (ahead != nullptr && differ(vectors->getPositions(), ahead->positions))
+    run.isContextAhead = ahead.has_value();
+    if (ahead && differ(vectors->getPositions(), ahead->positions))
         run.contextPositions = ahead->positions;
-    if (ahead != nullptr && differ(vectors->getVelocities(), ahead->velocities))
+    if (ahead && differ(vectors->getVelocities(), ahead->velocities))
         run.contextVelocities = ahead->velocities;
 }
 
@@ -430,14 +468,14 @@ bool HostRunDevice<Method>::resume(const RunState& run, const IntegratorSettings
     const double larger = std::max(std::fabs(energy), std::fabs(run.groupEnergy));
     if (!agree(forces, run.forces) || !(std::fabs(energy - run.groupEnergy) <= FORCE_ROUNDING * larger))
         return false;
-    resumeMethod({positions, velocities, forces, energy}, run, saved);
+    method.resume(positions, velocities, forces, energy, run, saved);
     ahead.reset();
     if (run.isContextAhead)
-        ahead.reset(new Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,
-                              run.contextVelocities.empty() ? vectors->getVelocities() : run.contextVelocities});
+        ahead = Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,
+                      run.contextVelocities.empty() ? vectors->getVelocities() : run.contextVelocities};
     std::copy(run.boxVectors, run.boxVectors + 3, boxVectors);
     return true;
 }
 
 template class OpenMMVRattle::HostRunDevice<VRattleRun>;
-template class OpenMMVRattle::HostRunDevice<LangevinDynamics>;
+template class OpenMMVRattle::HostRunDevice<LangevinRun>;

@@ -11,14 +11,15 @@
 #include "run/ForceReach.h"
 #include "run/RunDevice.h"
 #include <memory>
+#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 /**
- * A device that computes on the host: it moves data between the vectors of a Context and a method of integration, and asks for the
- * forces. What is particular to a method is in the classes derived from this one, which are all that a run needs on Reference and
- * the platforms derived from it; on a GPU they do what is rare, such as starts.
+ * A device that computes on the host: it moves data between the vectors of a Context and a method of integration, VRattleRun or
+ * LangevinRun, and asks for the forces. It is all that a run needs on Reference and the platforms derived from it; on a GPU it does
+ * what is rare, such as starts.
  *
  * A method computes no forces. A step of it is one or more passes of two halves, around an evaluation of the forces each:
  *
@@ -27,7 +28,7 @@ namespace OpenMMVRattle {
  *         ... compute the forces there ...
  *     } while (!method.finish(forces, groupEnergy));         // the step is complete: new positions, velocities, forces
  *
- * Until finish() has returned true, the state before the step is untouched. What else there is to a method: VRattleRun.
+ * Until finish() has returned true, the state before the step is untouched.
  */
 template <class Method> class HostRunDevice : public RunDevice {
 public:
@@ -40,11 +41,11 @@ public:
     }
     void setSettings(const IntegratorSettings& settings) override;
     bool setParameters(const std::vector<ExpressionConstraint>& given) override;
-    std::vector<double> getReferences() override {
-        return method.getReferences();
+    Findings getFindings() override {
+        return method.getFindings();
     }
-    void setReferences(const std::vector<double>& references) override {
-        method.setReferences(references);
+    void setFindings(const Findings& findings) override {
+        method.setFindings(findings);
     }
     bool updateState() override {
         return vectors->updateState();
@@ -61,6 +62,7 @@ public:
     void settle() override {
     }
     void reverse() override;
+    void tryOut(double stepSize, int count, const std::function<void(const std::vector<double>&)>& look) override;
     LastStep getLastStep() override {
         return lastStep;
     }
@@ -70,31 +72,30 @@ public:
     long long getStepCount() override {
         return vectors->getStepCount();
     }
+    std::vector<double> getMonitorValues() override {
+        return method.getMonitorValues();
+    }
     std::vector<double> getMultipliers() override;
     double getExpressionMultiplier(int index) override;
     double computeKineticEnergy() override;
+    double computeHalfStepKineticEnergy() override;
+    double getNegligibleValue() override {
+        return method.getNegligibleValue();
+    }
     long long getNumForceEvaluations() override {
         return numForceEvaluations;
     }
-    long long getNumSolverIterations() override {
-        return method.getNumIterations();
+    StepCounts getCounts() override {
+        return method.getCounts();
     }
     void save(RunState& run) override;
+    bool canResume(const RunState& run, const IntegratorSettings& saved) override {
+        return method.canResume(run, saved);
+    }
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
     typedef ContextVectors::Vectors Vectors;
-    /** An on-step state that satisfies the constraints. */
-    struct State {
-        const Vectors &positions, &velocities, &forces;
-        double groupEnergy;
-    };
-    /** Give the method its settings, but for the parameters of expressions. */
-    virtual void setMethod(const IntegratorSettings& settings) = 0;
-    /** Write down what the method goes on with beside the state. */
-    virtual void saveMethod(RunState& run) = 0;
-    /** Let the method go on from a saved run. */
-    virtual void resumeMethod(const State& state, const RunState& run, const IntegratorSettings& saved) = 0;
     /** The Context, where it is not in the method's state: as the user or a Force has left it, until a step is complete. */
     struct Ahead {
         Vectors positions, velocities;
@@ -102,7 +103,7 @@ protected:
     /** Compute the forces at the Context's positions; returns the energy of the monitor's group there. */
     virtual double computeForces();
     double computeForcesAt(const Vectors& positions, Vectors& forces);
-    double advance(double maxTime, double direction);
+    double advance(double maxTime);
     void putBack();
     const Vectors& knownPositions() const;
     const Vectors& knownVelocities() const;
@@ -111,8 +112,7 @@ protected:
         return 0;
     }
     std::vector<double> sumPositions();
-    /** Whether two sets of positions or velocities are others, for the particles that move. */
-    virtual bool differ(const Vectors& a, const Vectors& b);
+    bool differ(const Vectors& a, const Vectors& b);
     void writeMovingPositions(const Vectors& positions);
     void writeMovingVelocities(const Vectors& velocities);
     void copyMoving(const Vectors& from, Vectors& to);
@@ -125,7 +125,7 @@ protected:
     int forceGroups, monitorForceGroup;
     bool hasMassless;
     ForceReach reach;
-    std::unique_ptr<Ahead> ahead;
+    std::optional<Ahead> ahead;
     OpenMM::Vec3 boxVectors[3]; // when they were last looked at
     LastStep lastStep;
     long long numForceEvaluations;

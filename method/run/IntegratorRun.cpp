@@ -29,26 +29,6 @@ const double NO_LIMIT = std::numeric_limits<double>::infinity();
     throw OpenMMException(message.str());
 }
 
-// A trial run while it lives.
-class Trial {
-public:
-    Trial(RunDevice& device, double stepSize, bool isBackwards) : device(device) {
-        device.beginTrial(stepSize, isBackwards);
-    }
-    ~Trial() {
-        device.endTrial();
-    }
-    Trial(const Trial&) = delete;
-    Trial& operator=(const Trial&) = delete;
-    vector<double> step() {
-        device.takeTrialStep();
-        return device.getMonitorValues();
-    }
-
-private:
-    RunDevice& device;
-};
-
 } // namespace
 
 IntegratorRun::IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles,
@@ -323,12 +303,10 @@ vector<double> IntegratorRun::calibrate(int steps) {
         return findAutomaticReferences(steps);
     vector<double> means(settings.monitors.size(), 0.0);
     try {
-        Trial trial(device, settings.stepSize, false);
-        for (int i = 0; i < steps; i++) {
-            const vector<double> values = trial.step();
+        device.tryOut(settings.stepSize, steps, [&](const vector<double>& values) {
             for (size_t k = 0; k < means.size(); k++)
                 means[k] += values[k] / steps;
-        }
+        });
     }
     catch (const StepFailure& failure) {
         throwFailure(settings, "calibrate()", device.getTime(), failure.what(),
@@ -349,12 +327,10 @@ vector<double> IntegratorRun::findAutomaticReferences(int steps) {
         vector<double> logarithms(AutomaticControl::NUM_MONITORS, 0.0);
         const double negligible = device.getNegligibleValue();
         try {
-            Trial trial(device, stepSize, false);
-            for (int i = 0; i < steps; i++) {
-                const vector<double> values = trial.step();
+            device.tryOut(stepSize, steps, [&](const vector<double>& values) {
                 for (size_t k = 0; k < logarithms.size(); k++)
                     logarithms[k] += std::log(std::max(values[k], negligible)) / steps;
-            }
+            });
         }
         catch (const StepFailure& failure) {
             if (halvings == MAX_HALVINGS)
@@ -392,17 +368,18 @@ double IntegratorRun::getReference(int index) {
         takeSaved();
         takeSettings();
     }
-    return getReferences()[index];
+    return getFindings().references[index];
 }
 
 // Of the settings that there are, though the device may have those before.
-vector<double> IntegratorRun::getReferences() {
+Findings IntegratorRun::getFindings() {
+    Findings findings = device.getFindings();
     const bool haveSameUnits = std::equal(
         settings.monitors.begin(), settings.monitors.end(), applied.monitors.begin(), applied.monitors.end(),
         [](const StepMonitor::Term& a, const StepMonitor::Term& b) { return a.kind == b.kind && a.order == b.order; });
-    if (haveSameUnits && settings.isAutomatic == applied.isAutomatic)
-        return device.getReferences();
-    return vector<double>(settings.getNumReferences(), 0.0);
+    if (!haveSameUnits || settings.isAutomatic != applied.isAutomatic)
+        findings.references.assign(settings.getNumReferences(), 0.0);
+    return findings;
 }
 
 double IntegratorRun::getMonitorValue(int index) {
@@ -423,7 +400,7 @@ double IntegratorRun::getExpressionMultiplier(int index) {
 vector<double> IntegratorRun::getRandomState() {
     if (settings.langevin && canTakeSettings())
         takeSettings();
-    return device.getRandomState();
+    return device.getFindings().random;
 }
 
 double IntegratorRun::computeKineticEnergy() {
@@ -463,9 +440,7 @@ RunState IntegratorRun::save() {
     run.areForcesOutdated = areForcesChanged;
     run.lastStepSize = toldSize ? *toldSize : device.getLastStep().size;
     run.lastDensity = getStepDensity();
-    run.references = getReferences();
-    run.referenceTemperature = device.getReferenceTemperature();
-    run.randomState = device.getRandomState();
+    run.findings = getFindings();
     if (!run.startsAfresh)
         device.save(run);
     return run;
@@ -489,12 +464,15 @@ void IntegratorRun::resume(const RunState& run) {
     if (!canTakeSettings())
         return;
     takeSettings();
-    if ((int) run.references.size() == settings.getNumReferences()) {
-        device.setReferences(run.references);
-        device.setReferenceTemperature(run.referenceTemperature);
+    Findings findings = run.findings;
+    const Findings own = device.getFindings();
+    if ((int) findings.references.size() != settings.getNumReferences()) {
+        findings.references = own.references;
+        findings.referenceTemperature = own.referenceTemperature;
     }
-    if (!run.randomState.empty())
-        device.setRandomState(run.randomState);
+    if (findings.random.empty())
+        findings.random = own.random;
+    device.setFindings(findings);
     if (run.system == system && !run.startsAfresh && device.canResume(run, settings))
         saved = std::make_unique<RunState>(run);
 }

@@ -101,7 +101,7 @@ private:
     void prepare(bool areForcesInvalid, bool isForStep = false);
     void findTask(bool areForcesInvalid, bool isForStep);
     void fulfilTask();
-    std::vector<double> getReferences();
+    Findings getFindings();
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);
     std::vector<double> findAutomaticReferences(int steps);

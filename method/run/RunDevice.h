@@ -4,15 +4,14 @@
 #ifndef OPENMMVRATTLE_RUNDEVICE_H_
 #define OPENMMVRATTLE_RUNDEVICE_H_
 
-#include <stdexcept>
-#include <string>
+#include "run/RunState.h"
+#include <functional>
 #include <vector>
 
 namespace OpenMMVRattle {
 
 struct ExpressionConstraint;
 struct IntegratorSettings;
-struct RunState;
 
 /**
  * All that a run needs of a platform: IntegratorRun decides what is to be done, a device does it where the positions are.
@@ -53,10 +52,9 @@ public:
      * @return whether any is another
      */
     virtual bool setParameters(const std::vector<ExpressionConstraint>& given) = 0;
-    /** The reference values in force of the monitors, or of the two of automatic step control; 0 where there is none yet. */
-    virtual std::vector<double> getReferences() = 0;
-    /** Put reference values in force, as from a saved run or a trial run; 0 for those that are not known. */
-    virtual void setReferences(const std::vector<double>& references) = 0;
+    /** What has been found in the course of the run, and what is to be in force of it, as from a saved run. */
+    virtual Findings getFindings() = 0;
+    virtual void setFindings(const Findings& findings) = 0;
 
     // -------------------------------------------------------------------------------------- what happens to the Context
 
@@ -138,27 +136,16 @@ public:
     virtual double getTime() = 0;
     virtual long long getStepCount() = 0;
 
-    // -------------------------------------------------------------------------------------- trial runs of fixed steps
-
-    // Of methods that are calibrated with them; others need none of these.
-
     /**
-     * Begin to take steps of a fixed size from the method's state, which have no density and are put back by endTrial(). What is
-     * asked of the device in between concerns the trial. Forces see the time of the trial, and the step count that there is.
+     * Try out steps of a fixed size, which have no density, from the method's state, and put everything back but the counts of
+     * work. Forces see the time of the trial, and the step count that there is.
      *
-     * @param stepSize       the size of all steps (ps)
-     * @param isBackwards    whether they go back in time (from the same positions with velocities of the other sign)
+     * @param stepSize    the size of all steps (ps)
+     * @param count       how many
+     * @param look        is given getMonitorValues() at the end of each
+     * @throws StepFailure    if one of them cannot be completed
      */
-    virtual void beginTrial(double stepSize, bool isBackwards) {
-        (void) stepSize, (void) isBackwards;
-        throw std::logic_error("this method has no trial runs");
-    }
-    /** Take one; may throw a StepFailure at once. The trial is over then too, and its effects put back. */
-    virtual void takeTrialStep() {
-    }
-    /** Put back everything but the counts of work. Does nothing if there is no trial. */
-    virtual void endTrial() {
-    }
+    virtual void tryOut(double stepSize, int count, const std::function<void(const std::vector<double>&)>& look) = 0;
 
     // -------------------------------------------------------------------------------------- numbers at the method's state
 
@@ -174,57 +161,20 @@ public:
     virtual bool usesForcesOfOthers() {
         return false;
     }
-    /** How often forces have been computed, iterations of the solver taken, and steps rescued, since the device exists. */
+    /** A value of the monitors of automatic step control that is no more than this is nothing but rounding. */
+    virtual double getNegligibleValue() = 0;
+    /** At constant temperature: the kinetic energy that is reported, which is not that of the velocities; the two states agree. */
+    virtual double computeHalfStepKineticEnergy() = 0;
+    /** How often forces have been computed since the device exists. */
     virtual long long getNumForceEvaluations() = 0;
-    virtual long long getNumSolverIterations() = 0;
-    virtual long long getNumRescues() {
-        return 0;
-    }
-
+    /** What else there has been of work since then. */
+    virtual StepCounts getCounts() = 0;
     /** Whether the last step() was for a GPU to take, and not for the host with forces from it. */
     virtual bool hasSteppedOnDevice() {
         return false;
     }
 
-    // ---------------------------------------------------------------------------------------- automatic step control
-
-    /** A value of its monitors that is no more than this is nothing but rounding. */
-    virtual double getNegligibleValue() {
-        return 0;
-    }
-    /** 2K/f (kJ/mol) where its references were found, which belongs to these; 0 if they were not. */
-    virtual double getReferenceTemperature() {
-        return 0;
-    }
-    virtual void setReferenceTemperature(double) {
-    }
-    /** The most steps in a row that were shorter than a tenth of the nominal one. */
-    virtual long long getNumShortSteps() {
-        return 0;
-    }
-
-    // ------------------------------------------------------------------------------------------ constant temperature
-
-    /** The kinetic energy that is reported where it is not that of the Context's velocities; the two states agree. */
-    virtual double computeHalfStepKineticEnergy() {
-        return computeKineticEnergy();
-    }
-    /** How many steps have been made of substeps since the device exists, and of how many at most. */
-    virtual long long getNumSubstepped() {
-        return 0;
-    }
-    virtual int getLargestSubsteps() {
-        return 1;
-    }
-
     // ------------------------------------------------------------------------------------------- saving and resuming
-
-    /** The seed in force and how many steps have drawn random numbers with it; empty if there are none. */
-    virtual std::vector<double> getRandomState() {
-        return {};
-    }
-    virtual void setRandomState(const std::vector<double>&) {
-    }
 
     /**
      * Write down what the method goes on with beside settings and the state of the Context: all of RunState behind startsAfresh.

@@ -24,54 +24,153 @@ namespace {
                           "together");
 }
 
-template <class T> void writeValue(std::ostream& stream, const T& value) {
-    stream.write(reinterpret_cast<const char*>(&value), sizeof(T));
-}
+typedef std::map<string, vector<double>> Lists;
 
-template <class T> void readValue(std::istream& stream, T& value) {
-    if (!stream.read(reinterpret_cast<char*>(&value), sizeof(T)))
-        throwDamaged();
-}
-
-template <class T> void writeArray(std::ostream& stream, const vector<T>& values) {
-    writeValue(stream, (long long) values.size());
-    for (const T& value : values)
-        writeValue(stream, value);
-}
-
-template <class T> void readArray(std::istream& stream, vector<T>& values) {
-    long long size;
-    readValue(stream, size);
-    values.clear();
-    for (long long i = 0; i < size; i++) { // grows no further than the stream goes, whatever the size says
-        values.emplace_back();
-        readValue(stream, values.back());
+// Writes into a stream in binary form, without names, or reads from one.
+class BinaryForm {
+public:
+    BinaryForm(std::ostream* to, std::istream* from) : to(to), from(from) {
     }
-}
+    template <class T> void add(const char*, T& value) {
+        char* bytes = reinterpret_cast<char*>(&value);
+        if (to != nullptr)
+            to->write(bytes, sizeof(T));
+        else if (!from->read(bytes, sizeof(T)))
+            throwDamaged();
+    }
+    template <class T> void add(const char* name, vector<T>& values) {
+        long long size = (long long) values.size();
+        add(name, size);
+        if (to == nullptr)
+            values.clear();
+        for (long long i = 0; i < size; i++) {
+            if (to == nullptr) // grows no further than the stream goes, whatever the size says
+                values.emplace_back();
+            add(name, values[i]);
+        }
+    }
+    void add(const char* name, Lists& lists) {
+        const vector<Lists::value_type> given(lists.begin(), lists.end());
+        long long size = (long long) given.size();
+        add(name, size);
+        for (long long i = 0; i < size; i++) {
+            vector<char> key;
+            if (to != nullptr)
+                key.assign(given[i].first.begin(), given[i].first.end());
+            add(name, key);
+            add(name, lists[string(key.begin(), key.end())]);
+        }
+    }
+    void addIfAny(const char* name, vector<double>& values) {
+        add(name, values);
+    }
 
-void writeArray(SerializationNode& node, const string& name, const vector<double>& values) {
-    SerializationNode& array = node.createChildNode(name);
-    for (double value : values)
-        array.createChildNode("Value").setDoubleProperty("v", value);
-}
+private:
+    std::ostream* to; // or null
+    std::istream* from;
+};
 
-void readArray(const SerializationNode& node, const string& name, vector<double>& values) {
-    values.clear();
-    for (const SerializationNode& child : node.getChildNode(name).getChildren())
-        values.push_back(child.getDoubleProperty("v"));
-}
+// Writes into a node of XML, or reads from one.
+class NodeForm {
+public:
+    NodeForm(SerializationNode* to, const SerializationNode* from) : to(to), from(from) {
+    }
+    void add(const char* name, bool& value) {
+        if (to != nullptr)
+            to->setBoolProperty(name, value);
+        else
+            value = from->getBoolProperty(name);
+    }
+    void add(const char* name, double& value) {
+        if (to != nullptr)
+            to->setDoubleProperty(name, value);
+        else
+            value = from->getDoubleProperty(name);
+    }
+    void add(const char* name, unsigned long long& value) {
+        if (to != nullptr)
+            to->setLongProperty(name, (long long) value);
+        else
+            value = (unsigned long long) from->getLongProperty(name);
+    }
+    void add(const char*, Vec3& vector) {
+        add("x", vector[0]);
+        add("y", vector[1]);
+        add("z", vector[2]);
+    }
+    void add(const string& name, vector<double>& values) {
+        addList(name, "Value", "v", values);
+    }
+    void add(const string& name, vector<Vec3>& values) {
+        addList(name, "Vector", "", values);
+    }
+    void add(const char* name, Vec3 (&box)[3]) {
+        vector<Vec3> vectors(box, box + 3);
+        add(name, vectors);
+        if (vectors.size() != 3)
+            throwDamaged();
+        std::copy(vectors.begin(), vectors.end(), box);
+    }
+    void add(const char* name, Lists& lists) {
+        NodeForm form = inside(name);
+        if (to == nullptr)
+            for (const SerializationNode& list : form.from->getChildren())
+                lists[list.getName()];
+        for (auto& list : lists)
+            form.add(list.first, list.second);
+    }
+    void addIfAny(const char* name, vector<double>& values) {
+        bool isThere = to != nullptr && !values.empty();
+        if (to == nullptr)
+            for (const SerializationNode& child : from->getChildren())
+                isThere = isThere || child.getName() == name;
+        if (isThere)
+            add(name, values);
+    }
 
-void writeArray(SerializationNode& node, const string& name, const vector<Vec3>& values) {
-    SerializationNode& array = node.createChildNode(name);
-    for (const Vec3& v : values)
-        array.createChildNode("Vector").setDoubleProperty("x", v[0]).setDoubleProperty("y", v[1]).setDoubleProperty(
-            "z", v[2]);
-}
+private:
+    NodeForm inside(const string& name) {
+        return to != nullptr ? NodeForm(&to->createChildNode(name), nullptr)
+                             : NodeForm(nullptr, &from->getChildNode(name));
+    }
+    template <class T>
+    void addList(const string& name, const char* itemName, const char* numberName, vector<T>& values) {
+        NodeForm list = inside(name);
+        if (to == nullptr)
+            values.resize(list.from->getChildren().size());
+        for (size_t i = 0; i < values.size(); i++) {
+            NodeForm item = to != nullptr ? list.inside(itemName) : NodeForm(nullptr, &list.from->getChildren()[i]);
+            item.add(numberName, values[i]);
+        }
+    }
+    SerializationNode* to; // or null
+    const SerializationNode* from;
+};
 
-void readArray(const SerializationNode& node, const string& name, vector<Vec3>& values) {
-    values.clear();
-    for (const SerializationNode& v : node.getChildNode(name).getChildren())
-        values.emplace_back(v.getDoubleProperty("x"), v.getDoubleProperty("y"), v.getDoubleProperty("z"));
+// What is written down of a run: all of its members, in this order, with the names that they have in XML.
+template <class Form> void exchange(RunState& run, Form form) {
+    form.add("system", run.system);
+    form.add("context", run.context);
+    form.add("parameters", run.parameters);
+    form.add("areForcesOutdated", run.areForcesOutdated);
+    form.add("lastStepSize", run.lastStepSize);
+    form.add("lastDensity", run.lastDensity);
+    form.add("References", run.findings.references);
+    form.add("referenceTemperature", run.findings.referenceTemperature);
+    form.addIfAny("RandomState", run.findings.random);
+    form.add("startsAfresh", run.startsAfresh);
+    if (run.startsAfresh)
+        return;
+    form.add("Method", run.methodValues);
+    form.add("HalfStepVelocities", run.halfStepVelocities);
+    form.add("Forces", run.forces);
+    form.add("groupEnergy", run.groupEnergy);
+    form.add("BoxVectors", run.boxVectors);
+    form.add("Positions", run.positions);
+    form.add("Velocities", run.velocities);
+    form.add("isContextAhead", run.isContextAhead);
+    form.add("ContextPositions", run.contextPositions);
+    form.add("ContextVelocities", run.contextVelocities);
 }
 
 } // namespace
@@ -96,122 +195,21 @@ unsigned long long RunState::fingerprintOf(const OpenMM::System& system, const I
     return fingerprint.get();
 }
 
+// Writing changes nothing.
 void RunState::write(std::ostream& stream) const {
-    writeValue(stream, system);
-    writeValue(stream, context);
-    writeValue(stream, parameters);
-    writeValue(stream, areForcesOutdated);
-    writeValue(stream, lastStepSize);
-    writeValue(stream, lastDensity);
-    writeArray(stream, references);
-    writeValue(stream, referenceTemperature);
-    writeArray(stream, randomState);
-    writeValue(stream, startsAfresh);
-    if (startsAfresh)
-        return;
-    writeValue(stream, (long long) methodValues.size());
-    for (const auto& entry : methodValues) {
-        writeArray(stream, vector<char>(entry.first.begin(), entry.first.end()));
-        writeArray(stream, entry.second);
-    }
-    writeArray(stream, halfStepVelocities);
-    writeArray(stream, forces);
-    writeValue(stream, groupEnergy);
-    writeValue(stream, boxVectors);
-    writeArray(stream, positions);
-    writeArray(stream, velocities);
-    writeValue(stream, isContextAhead);
-    writeArray(stream, contextPositions);
-    writeArray(stream, contextVelocities);
+    exchange(const_cast<RunState&>(*this), BinaryForm(&stream, nullptr));
 }
 
 void RunState::read(std::istream& stream) {
-    readValue(stream, system);
-    readValue(stream, context);
-    readValue(stream, parameters);
-    readValue(stream, areForcesOutdated);
-    readValue(stream, lastStepSize);
-    readValue(stream, lastDensity);
-    readArray(stream, references);
-    readValue(stream, referenceTemperature);
-    readArray(stream, randomState);
-    readValue(stream, startsAfresh);
-    if (startsAfresh)
-        return;
-    long long numEntries;
-    readValue(stream, numEntries);
-    for (long long i = 0; i < numEntries; i++) {
-        vector<char> name;
-        readArray(stream, name);
-        readArray(stream, methodValues[string(name.begin(), name.end())]);
-    }
-    readArray(stream, halfStepVelocities);
-    readArray(stream, forces);
-    readValue(stream, groupEnergy);
-    readValue(stream, boxVectors);
-    readArray(stream, positions);
-    readArray(stream, velocities);
-    readValue(stream, isContextAhead);
-    readArray(stream, contextPositions);
-    readArray(stream, contextVelocities);
+    exchange(*this, BinaryForm(nullptr, &stream));
 }
 
 void RunState::write(SerializationNode& node) const {
-    node.setLongProperty("system", (long long) system).setLongProperty("context", (long long) context);
-    node.setLongProperty("parameters", (long long) parameters).setBoolProperty("areForcesOutdated", areForcesOutdated);
-    node.setDoubleProperty("lastStepSize", lastStepSize).setDoubleProperty("lastDensity", lastDensity);
-    writeArray(node, "References", references);
-    node.setDoubleProperty("referenceTemperature", referenceTemperature);
-    if (!randomState.empty())
-        writeArray(node, "RandomState", randomState);
-    node.setBoolProperty("startsAfresh", startsAfresh);
-    if (startsAfresh)
-        return;
-    SerializationNode& method = node.createChildNode("Method");
-    for (const auto& entry : methodValues)
-        writeArray(method, entry.first, entry.second);
-    writeArray(node, "HalfStepVelocities", halfStepVelocities);
-    writeArray(node, "Forces", forces);
-    node.setDoubleProperty("groupEnergy", groupEnergy);
-    writeArray(node, "BoxVectors", vector<Vec3>(boxVectors, boxVectors + 3));
-    writeArray(node, "Positions", positions);
-    writeArray(node, "Velocities", velocities);
-    node.setBoolProperty("isContextAhead", isContextAhead);
-    writeArray(node, "ContextPositions", contextPositions);
-    writeArray(node, "ContextVelocities", contextVelocities);
+    exchange(const_cast<RunState&>(*this), NodeForm(&node, nullptr));
 }
 
 void RunState::read(const SerializationNode& node) {
-    system = (unsigned long long) node.getLongProperty("system");
-    context = (unsigned long long) node.getLongProperty("context");
-    parameters = (unsigned long long) node.getLongProperty("parameters");
-    areForcesOutdated = node.getBoolProperty("areForcesOutdated");
-    lastStepSize = node.getDoubleProperty("lastStepSize");
-    lastDensity = node.getDoubleProperty("lastDensity");
-    readArray(node, "References", references);
-    referenceTemperature = node.getDoubleProperty("referenceTemperature", 0.0);
-    for (const SerializationNode& child : node.getChildren())
-        if (child.getName() == "RandomState")
-            readArray(node, "RandomState", randomState);
-    startsAfresh = node.getBoolProperty("startsAfresh");
-    if (startsAfresh)
-        return;
-    for (const SerializationNode& entry : node.getChildNode("Method").getChildren())
-        readArray(node.getChildNode("Method"), entry.getName(), methodValues[entry.getName()]);
-    readArray(node, "HalfStepVelocities", halfStepVelocities);
-    readArray(node, "Forces", forces);
-    groupEnergy = node.getDoubleProperty("groupEnergy");
-    vector<Vec3> box;
-    readArray(node, "BoxVectors", box);
-    if (box.size() != 3)
-        throwDamaged();
-    for (int i = 0; i < 3; i++)
-        boxVectors[i] = box[i];
-    readArray(node, "Positions", positions);
-    readArray(node, "Velocities", velocities);
-    isContextAhead = node.getBoolProperty("isContextAhead");
-    readArray(node, "ContextPositions", contextPositions);
-    readArray(node, "ContextVelocities", contextVelocities);
+    exchange(*this, NodeForm(nullptr, &node));
 }
 
 const vector<double>& RunState::getMethodValues(const string& name, size_t count) const {
@@ -235,7 +233,7 @@ void RunState::Archive::add(const string& name, double* values, size_t count) {
 }
 
 void RunState::requireSizes(int numParticles, int numMonitors) const {
-    bool fits = (int) references.size() == numMonitors;
+    bool fits = (int) findings.references.size() == numMonitors;
     if (!startsAfresh)
         fits = fits && (int) forces.size() == numParticles;
     for (const vector<Vec3>* optional :

@@ -16,6 +16,23 @@ namespace OpenMMVRattle {
 
 struct IntegratorSettings;
 
+/** What a method finds in the course of a run, and a new start does not take from it. */
+struct Findings {
+    std::vector<double> references;  // U_k,ref in force of each value of getMonitorValues(), 0 if not known
+    double referenceTemperature =
+        0; // 2K/f (kJ/mol) where those of automatic step control were found; 0 if they were not
+    std::vector<double> random;      // the seed in force, and how many steps have drawn numbers with it; or empty
+};
+
+/** What has been counted of the steps of a method since it exists; each counts what it knows of. */
+struct StepCounts {
+    long long solverIterations = 0;
+    long long rescues = 0;    // steps that took the density of another update
+    long long shortSteps = 0; // the most in a row that were shorter than a tenth of the nominal one
+    long long substepped = 0; // steps that were made of substeps
+    int largestSubsteps = 1;  // and of how many at most
+};
+
 /**
  * What a run needs to go on as if nothing had happened, beside the settings of the integrator and the positions,
  * velocities and parameters of the Context. Checkpoints and States hold it.
@@ -65,9 +82,7 @@ struct RunState {
     bool areForcesOutdated = false;    // the forces are those before the parameters of a Force were changed
     double lastStepSize = 0;           // ps; 0 before the first step
     double lastDensity = 1;            // rho of the last step
-    std::vector<double> references;    // U_k,ref in force, 0 if not known
-    double referenceTemperature = 0;   // RunDevice::getReferenceTemperature()
-    std::vector<double> randomState;   // RunDevice::getRandomState()
+    Findings findings;
     bool startsAfresh = true;          // no step since the user changed the state: nothing of what follows is there
 
     // The numbers that the method goes on with, by names that the device gives them.

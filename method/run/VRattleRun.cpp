@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: MIT
 
 #include "run/VRattleRun.h"
+#include "constraints/StepFailure.h"
+#include "run/IntegratorSettings.h"
 #include <algorithm>
 #include <cmath>
 
@@ -15,6 +17,35 @@ namespace {
 const double TINY = 1e-100;
 
 } // namespace
+
+void VRattleRun::takeSettings(const IntegratorSettings& from) {
+    Settings to;
+    to.stepSize = from.stepSize;
+    to.minimumStep = from.stepSize > 0 ? from.getMinimumStep() : 0.0;
+    to.maximumStep = from.stepSize > 0 ? from.getMaximumStep() : 0.0;
+    to.tolerance = from.constraintTolerance;
+    to.update = from.update;
+    to.terms = from.monitors;
+    to.isFixedStep = false;
+    to.isAutomatic = from.isAutomatic;
+    to.automaticRequest = from.automaticRequest;
+    to.calibrationSteps = from.calibrationSteps;
+    if (from.isAutomatic)
+        std::copy(std::begin(from.automaticReferences), std::end(from.automaticReferences), to.automaticReferences);
+    if (getConstraintSystem().getNumConstraints() == 0 && StepMonitor::needConstraints(to.terms))
+        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
+                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
+                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
+    setSettings(to);
+}
+
+StepCounts VRattleRun::getCounts() {
+    StepCounts counts;
+    counts.solverIterations = getNumIterations();
+    counts.rescues = getNumRescues();
+    counts.shortSteps = (long long) getAutomaticControl().getMemory().mostShortSteps;
+    return counts;
+}
 
 void VRattleRun::putBack(const Kept& kept) {
     settings = kept.settings;
@@ -47,6 +78,14 @@ template <class Change> void VRattleRun::attempt(const Change& change) {
 void VRattleRun::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                        double energy) {
     attempt([&] { VRattleDynamics::begin(positions, velocities, forces, energy); });
+}
+
+void VRattleRun::beginFixedSteps(double stepSize) {
+    Settings fixed = settings;
+    fixed.isFixedStep = true;
+    fixed.stepSize = stepSize;
+    setSettings(fixed);
+    begin(vector<Vec3>(now.q), vector<Vec3>(now.v), vector<Vec3>(now.force), now.groupEnergy);
 }
 
 void VRattleRun::adoptParameters() {
@@ -162,4 +201,78 @@ void VRattleRun::changeForces(vector<Vec3>& forces, double energy) {
     }
     if (control->hasStarted())
         formHalfStepVelocities();
+}
+
+// ------------------------------------------------------------------------------------------------- saving and resuming
+
+void VRattleRun::exchange(StepState& state, Memory& memory, RunState::Archive archive, size_t numMonitors,
+                          bool isAutomatic) {
+    const size_t numConstraints = state.lambda.size(), numParameters = state.theta.values.size();
+    archive.add("hasDensity", memory.hasDensity);
+    archive.add("density", memory.rho);
+    archive.add("parameters", state.theta.values, numParameters);
+    archive.add("parameterRates", state.theta.rates, numParameters);
+    archive.add("multiplierOffset", state.offset.found, numConstraints);
+    archive.add("multipliers", state.lambda, numConstraints);
+    archive.add("monitorValues", state.values, numMonitors);
+    archive.add("hasHalfStepValue", memory.hasHalfStepValue);
+    archive.add("halfStepValue", memory.halfStepValue);
+    archive.add("rate", memory.rate);
+    archive.add("densityOffset", memory.densityOffset);
+    if (!isAutomatic)
+        return;
+    AutomaticControl::Memory& control = memory.automatic;
+    archive.add("automaticBehind", control.behind, AutomaticControl::NUM_MONITORS);
+    archive.add("automaticAhead", control.ahead, AutomaticControl::NUM_MONITORS);
+    archive.add("automaticValues", control.values, AutomaticControl::NUM_MONITORS);
+    archive.add("automaticForceSquares", control.forceSquares, getAutomaticControl().getMemory().forceSquares.size());
+    double learning[] = {control.stepsSinceStart, control.numLearnt,   control.logarithms[0],
+                         control.logarithms[1],   control.temperature, control.following};
+    archive.add("automaticLearning", learning, 6);
+    control.stepsSinceStart = learning[0];
+    control.numLearnt = learning[1];
+    std::copy_n(learning + 2, AutomaticControl::NUM_MONITORS, control.logarithms);
+    control.temperature = learning[4];
+    control.following = learning[5];
+    double shortSteps[] = {control.shortSteps, control.mostShortSteps};
+    archive.add("automaticShortSteps", shortSteps, 2);
+    control.shortSteps = shortSteps[0];
+    control.mostShortSteps = shortSteps[1];
+}
+
+void VRattleRun::save(RunState& run) {
+    Kept kept = keep();
+    run.halfStepVelocities = kept.state.w;
+    for (size_t k = 0; k < kept.state.lambda.size(); k++) // the difference is all that counts
+        kept.state.offset.found[k] -= kept.state.offset.expected[k];
+    if (settings.isAutomatic)
+        kept.state.values.clear(); // which were of monitors
+    exchange(kept.state, kept.memory, RunState::Archive(run), kept.state.values.size(), settings.isAutomatic);
+}
+
+void VRattleRun::read(const RunState& run, const IntegratorSettings& saved, StepState& state, Memory& memory) {
+    exchange(state, memory, RunState::Archive(run), saved.isAutomatic ? 0 : saved.monitors.size(), saved.isAutomatic);
+    const vector<double>& rates = state.theta.rates;
+    state.theta.isMoving = std::any_of(rates.begin(), rates.end(), [](double rate) { return rate != 0; });
+    state.w = run.halfStepVelocities;
+    memory.references = run.findings.references;
+}
+
+bool VRattleRun::canResume(const RunState& run, const IntegratorSettings& saved) {
+    StepState state(getConstraintSystem());
+    Memory memory;
+    read(run, saved, state, memory);
+    return state.w.size() == state.q.size();
+}
+
+void VRattleRun::resume(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                        double energy, const RunState& run, const IntegratorSettings& saved) {
+    StepState state(getConstraintSystem());
+    Memory memory;
+    read(run, saved, state, memory);
+    state.q = positions;
+    state.v = velocities;
+    state.force = forces;
+    state.groupEnergy = energy;
+    resume(state, memory);
 }

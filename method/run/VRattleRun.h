@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_VRATTLERUN_H_
 
 #include "openmm/Vec3.h"
+#include "run/RunState.h"
 #include "step/VRattleDynamics.h"
 #include <functional>
 #include <map>
@@ -13,7 +14,12 @@
 
 namespace OpenMMVRattle {
 
-/** VRATTLE in a run, in which others change the state between two steps, keep it, put it back and carry it on elsewhere. */
+struct IntegratorSettings;
+
+/**
+ * VRATTLE in a run, in which others change the state between two steps, keep it, put it back, save it and carry it on elsewhere: the
+ * method of VariableStepRattleIntegrator. The other one is LangevinRun.
+ */
 class VRattleRun : public VRattleDynamics {
 public:
     using VRattleDynamics::VRattleDynamics;
@@ -27,6 +33,12 @@ public:
     /** Go through 0, ..., count - 1 on these threads, where that is faster: task(first, end). */
     template <class Task> void share(int count, const Task& task) {
         constraints.share(count, task);
+    }
+
+    /** Take over what of an integrator's settings is of the steps, but for the parameters of expressions. */
+    void takeSettings(const IntegratorSettings& integrator);
+    const Settings& getSettings() const {
+        return settings;
     }
 
     // ------------------------------------------------------------------------------------- what others see of the state
@@ -60,9 +72,19 @@ public:
     std::vector<double> getMonitorValues() const {
         return control->getValues();
     }
+    double getNegligibleValue() {
+        return automatic.getControl().getNegligibleValue();
+    }
     /** U_k,ref, 0 while it is not known; under automatic step control those of its two monitors. */
     std::vector<double> getReferences() const {
         return control->getReferences();
+    }
+    Findings getFindings() {
+        return {getReferences(), getAutomaticControl().getMemory().temperature, {}};
+    }
+    void setFindings(const Findings& findings) {
+        setReferences(findings.references);
+        automatic.getControl().setReferenceTemperature(findings.referenceTemperature);
     }
     long long getNumIterations() const {
         return solver.getNumIterations();
@@ -70,6 +92,7 @@ public:
     long long getNumRescues() const {
         return control->getNumRescues();
     }
+    StepCounts getCounts();
 
     // --------------------------------------------------------------------------------------------------------- memory
 
@@ -117,6 +140,8 @@ public:
     /** As its base does, but a failure leaves everything as it was. So does that of all that follows here. */
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
+    /** Go on with steps of a fixed size (ps), for a trial: who ends it puts back what was before. */
+    void beginFixedSteps(double stepSize);
     /**
      * Go on from a saved state as if nothing had happened: the following steps are the same to the last bit if the forces are. The
      * settings and the target are those there are, and K Lambda is found.
@@ -139,10 +164,6 @@ public:
     /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
     void setReferences(const std::vector<double>& references) {
         control->setReferences(references);
-    }
-    /** The 2K/f at which those of automatic step control were found. */
-    void setReferenceTemperature(double kT) {
-        automatic.getControl().setReferenceTemperature(kT);
     }
     /** u(q[n],p[n-1/2]), which (3.14) takes, for somebody who goes on elsewhere; it is evaluated if need be. */
     double findHalfStepValue() {
@@ -175,7 +196,20 @@ public:
      */
     void changeForces(std::vector<OpenMM::Vec3>& forces, double groupEnergy);
 
+    // -------------------------------------------------------------------------------------------- saving and resuming
+
+    /** Write down what the next step depends on, but for what HostRunDevice has written: positions, velocities and forces. */
+    void save(RunState& run);
+    /** Whether it can go on from a saved run; throws an OpenMMException if the parts of that do not fit together. */
+    bool canResume(const RunState& run, const IntegratorSettings& saved);
+    /** Go on from a saved run, with the on-step state that belongs to it. */
+    void resume(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const RunState& run,
+                const IntegratorSettings& saved);
+
 private:
+    void exchange(StepState& state, Memory& memory, RunState::Archive archive, size_t numMonitors, bool isAutomatic);
+    void read(const RunState& run, const IntegratorSettings& saved, StepState& state, Memory& memory);
     template <class Change> void attempt(const Change& change);
     void setMemory(const Memory& memory);
 };

@@ -32,7 +32,7 @@ public:
 
     void setSettings(const IntegratorSettings& settings) override {
         calls += 's';
-        references.assign(settings.getNumReferences(), 0.0);
+        findings.references.assign(settings.getNumReferences(), 0.0);
     }
     bool setParameters(const vector<ExpressionConstraint>& given) override {
         const double before = parameter;
@@ -41,12 +41,12 @@ public:
             calls += 'p';
         return parameter != before;
     }
-    vector<double> getReferences() override {
+    Findings getFindings() override {
         look();
-        return references;
+        return findings;
     }
-    void setReferences(const vector<double>& newReferences) override {
-        references = newReferences;
+    void setFindings(const Findings& newFindings) override {
+        findings = newFindings;
     }
     bool updateState() override {
         return areForcesInvalid;
@@ -108,11 +108,7 @@ public:
         look();
         return numTaken;
     }
-    void beginTrial(double, bool) override {
-    }
-    void takeTrialStep() override {
-    }
-    void endTrial() override {
+    void tryOut(double, int, const std::function<void(const vector<double>&)>&) override {
     }
     vector<double> getMonitorValues() override {
         look();
@@ -131,10 +127,10 @@ public:
     long long getNumForceEvaluations() override {
         return 0;
     }
-    long long getNumSolverIterations() override {
-        return 0;
+    StepCounts getCounts() override {
+        return {};
     }
-    long long getNumRescues() override {
+    double computeHalfStepKineticEnergy() override {
         return 0;
     }
     double getNegligibleValue() override {
@@ -161,7 +157,7 @@ private:
     void look() {
         numLooks += numAsked > numTaken;
     }
-    vector<double> references;
+    Findings findings;
 };
 
 const unsigned long long SYSTEM = 17;

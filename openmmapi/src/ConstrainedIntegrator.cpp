@@ -170,7 +170,7 @@ bool ConstrainedIntegrator::isOnDevice() const {
 }
 
 long long ConstrainedIntegrator::getNumSolverIterations() const {
-    return run == nullptr ? 0 : run->getDevice().getNumSolverIterations();
+    return run == nullptr ? 0 : run->getDevice().getCounts().solverIterations;
 }
 
 // ------------------------------------------------------------------------------------------ constraints by expressions
@@ -382,7 +382,7 @@ void ConstrainedIntegrator::resume(const IntegratorSettings& saved, RunState& st
         next.expressions = previous.expressions;
     next.fitDefaultMonitor(hasConstraints(context->getSystem(), next));
     if (next.isDefaultMonitor && next.monitors[0].kind != saved.monitors[0].kind)
-        state.references.clear();
+        state.findings.references.clear();
     run->requireUsable(state, next);
     takeOver(next);
     try {
@@ -452,7 +452,8 @@ void ConstrainedIntegrator::deserializeParameters(const SerializationNode& node)
     // So each keeps its seed, and no random number is drawn twice.
     saved->settings->setRandomSeed(settings->getRandomSeed());
     const vector<double> own = run->getRandomState();
-    if (!own.empty() && own.size() == state.randomState.size())
-        state.randomState = {own[0], std::max(own[1], state.randomState[1])};
+    vector<double>& random = state.findings.random;
+    if (!own.empty() && own.size() == random.size())
+        random = {own[0], std::max(own[1], random[1])};
     resume(*saved->settings, state);
 }

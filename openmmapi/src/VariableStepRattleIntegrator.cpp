@@ -203,11 +203,11 @@ double VariableStepRattleIntegrator::getMonitorValue(int index) const {
 }
 
 long long VariableStepRattleIntegrator::getNumRescues() const {
-    return run == nullptr ? 0 : run->getDevice().getNumRescues();
+    return run == nullptr ? 0 : run->getDevice().getCounts().rescues;
 }
 
 long long VariableStepRattleIntegrator::getNumShortSteps() const {
-    return run == nullptr ? 0 : run->getDevice().getNumShortSteps();
+    return run == nullptr ? 0 : run->getDevice().getCounts().shortSteps;
 }
 
 double VariableStepRattleIntegrator::getUsualStepSize() const {

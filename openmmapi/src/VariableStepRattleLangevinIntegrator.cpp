@@ -75,11 +75,11 @@ void VariableStepRattleLangevinIntegrator::setMaximumSubsteps(int substeps) {
 }
 
 long long VariableStepRattleLangevinIntegrator::getNumSubstepped() const {
-    return run == nullptr ? 0 : run->getDevice().getNumSubstepped();
+    return run == nullptr ? 0 : run->getDevice().getCounts().substepped;
 }
 
 int VariableStepRattleLangevinIntegrator::getLargestSubsteps() const {
-    return run == nullptr ? 1 : run->getDevice().getLargestSubsteps();
+    return run == nullptr ? 1 : run->getDevice().getCounts().largestSubsteps;
 }
 
 double VariableStepRattleLangevinIntegrator::getReferenceMonitorValue() const {

@@ -5,7 +5,7 @@
 #define OPENMMVRATTLE_COMMONLANGEVINDEVICE_H_
 
 #include "CommonRunDevice.h"
-#include "run/HostLangevinDevice.h"
+#include "run/LangevinRun.h"
 
 namespace OpenMMVRattle {
 
@@ -14,22 +14,17 @@ namespace OpenMMVRattle {
  * host takes those that do, from the state before them and with the same noise, and goes on as long as the next one begins with
  * substeps.
  */
-class CommonLangevinDevice : public CommonRunDevice<HostLangevinDevice> {
+class CommonLangevinDevice : public CommonRunDevice<LangevinRun> {
 public:
     using CommonRunDevice::CommonRunDevice;
-    std::vector<double> getReferences() override;
-    std::vector<double> getMonitorValues() override;
-    double computeHalfStepKineticEnergy() override;
-    long long getNumSubstepped() override;
-    int getLargestSubsteps() override;
-    std::vector<double> getRandomState() override;
-    void setRandomState(const std::vector<double>& state) override;
+    Findings getFindings() override;
 
 protected:
     bool canGoOnDevice() override;
     DeviceSteps::Settings makeDeviceSettings() override;
     DeviceSteps::State makeDeviceState() override;
-    void adopt(const State& state, const DeviceSteps::State& others) override;
+    void adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
+               const DeviceSteps::State& others) override;
     void carryOn(const DeviceSteps::State& others) override;
     bool doesFrameMatter() override;
     int getMostStepsUntilLook() const override {

@@ -6,9 +6,9 @@
 #include "ExpressionInfo.h"
 #include "constraints/StepFailure.h"
 #include "openmm/common/ContextSelector.h"
-#include "run/HostLangevinDevice.h"
-#include "run/HostVRattleDevice.h"
 #include "run/IntegratorSettings.h"
+#include "run/LangevinRun.h"
+#include "run/VRattleRun.h"
 #include <algorithm>
 #include <cmath>
 #include <iostream>
@@ -41,9 +41,9 @@ private:
 
 } // namespace
 
-template <class Host>
-CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
-                                       const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
+template <class Method>
+CommonRunDevice<Method>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
+                                         const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
         Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
         compute(compute), actions(context, compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false),
         hasBegun(false), isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0),
@@ -67,11 +67,11 @@ CommonRunDevice<Host>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::Com
 
 // ------------------------------------------------------------------------------------------------ from one to the other
 
-template <class Host> int CommonRunDevice<Host>::getNumWrites() const {
+template <class Method> int CommonRunDevice<Method>::getNumWrites() const {
     return static_cast<const ComputeVectors&>(*vectors).getNumWrites();
 }
 
-template <class Host> double CommonRunDevice<Host>::computeForces() {
+template <class Method> double CommonRunDevice<Method>::computeForces() {
     groupEnergy = Host::computeForces();
     hasForces = true;
     writeCount = getNumWrites();
@@ -82,7 +82,7 @@ template <class Host> double CommonRunDevice<Host>::computeForces() {
 }
 
 // OpenMM has the inverse masses beside the velocities, and Context::reinitialize() brings old ones back with these.
-template <class Host> void CommonRunDevice<Host>::correctMasses() {
+template <class Method> void CommonRunDevice<Method>::correctMasses() {
     ContextSelector selector(compute);
     auto correct = [&](auto& velocities) {
         compute.getVelm().download(velocities);
@@ -109,24 +109,24 @@ template <class Host> void CommonRunDevice<Host>::correctMasses() {
 
 // Whether the forces are those of the present state. Others may have computed them again, with an energy. A barostat that rejects a
 // move puts forces and the order of the atoms back.
-template <class Host> bool CommonRunDevice<Host>::areForcesValid() {
+template <class Method> bool CommonRunDevice<Method>::areForcesValid() {
     return hasForces && writeCount == getNumWrites() && context.getLastForceGroups() == forceGroups &&
            (!areAtomsReordered || compute.getAtomIndex() == order);
 }
 
-template <class Host> void CommonRunDevice<Host>::ensureForces() {
+template <class Method> void CommonRunDevice<Method>::ensureForces() {
     if (!areForcesValid())
         computeForces();
 }
 
 // Whether the next step is one in the middle of a run, all of whose numbers are known.
-template <class Host> bool CommonRunDevice<Host>::canStepOnDevice() {
-    return steps != nullptr && !reach.isUnknown && ahead == nullptr && canGoOnDevice();
+template <class Method> bool CommonRunDevice<Method>::canStepOnDevice() {
+    return steps != nullptr && !reach.isUnknown && !ahead && canGoOnDevice();
 }
 
 // Where parameters of expressions are others now molecules may be so too, that were identical; then OpenMM puts all atoms into another
 // order, for which nothing on the device is prepared between two steps.
-template <class Host> void CommonRunDevice<Host>::tellOfParameters() {
+template <class Method> void CommonRunDevice<Method>::tellOfParameters() {
     areParametersNew = true;
     if (steps == nullptr)
         return;
@@ -137,7 +137,7 @@ template <class Host> void CommonRunDevice<Host>::tellOfParameters() {
 }
 
 // The state goes to the device, where positions, velocities and forces are.
-template <class Host> void CommonRunDevice<Host>::beginOnDevice() {
+template <class Method> void CommonRunDevice<Method>::beginOnDevice() {
     ensureForces();
     if (!areSettingsOnDevice)
         steps->setSettings(makeDeviceSettings());
@@ -148,30 +148,30 @@ template <class Host> void CommonRunDevice<Host>::beginOnDevice() {
     areParametersNew = true;
 }
 
-template <class Host> ExpressionParameters CommonRunDevice<Host>::getDeviceParameters() {
+template <class Method> ExpressionParameters CommonRunDevice<Method>::getDeviceParameters() {
     return expressions.empty() ? method.getParameters()
                                : method.getConstraintSystem().fromGivenOrder(steps->getParameters());
 }
 
 // The host gets the device's state as well.
-template <class Host> void CommonRunDevice<Host>::bringToHost() {
+template <class Method> void CommonRunDevice<Method>::bringToHost() {
     settle();
     if (isOnHost)
         return;
     ensureForces();
-    adopt({vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy}, state);
+    adopt(vectors->getPositions(), vectors->getVelocities(), vectors->getForces(), groupEnergy, state);
     isOnHost = true;
 }
 
 // And goes on with it.
-template <class Host> void CommonRunDevice<Host>::takeToHost() {
+template <class Method> void CommonRunDevice<Method>::takeToHost() {
     bringToHost();
     isOnDevice = false;
 }
 
 // ----------------------------------------------------------------------------------------------------------- the steps
 
-template <class Host> void CommonRunDevice<Host>::step(double maxTime) {
+template <class Method> void CommonRunDevice<Method>::step(double maxTime) {
     if (maxTime < NO_LIMIT)
         settle();
     if (isOnDevice && !hasBegun && !expressions.empty())
@@ -195,7 +195,7 @@ template <class Host> void CommonRunDevice<Host>::step(double maxTime) {
     knownCount = vectors->getStepCount();
 }
 
-template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
+template <class Method> void CommonRunDevice<Method>::stepOnDevice(double maxTime) {
     if (numAsked == 0) {
         settledTime = vectors->getTime();
         settledCount = vectors->getStepCount();
@@ -225,7 +225,7 @@ template <class Host> void CommonRunDevice<Host>::stepOnDevice(double maxTime) {
 }
 
 // After the positions of a step. The state before it is kept in the order that there was.
-template <class Host> void CommonRunDevice<Host>::reorderAtoms() {
+template <class Method> void CommonRunDevice<Method>::reorderAtoms() {
     ContextSelector selector(compute);
     // Where no Force has a cutoff they stay in their order, and OpenMM counts on.
     const bool isDue = compute.getNonbondedUtilities().getUseCutoff() &&
@@ -242,7 +242,7 @@ template <class Host> void CommonRunDevice<Host>::reorderAtoms() {
 }
 
 // Of the state that has been put back.
-template <class Host> void CommonRunDevice<Host>::restoreOrder() {
+template <class Method> void CommonRunDevice<Method>::restoreOrder() {
     const Vectors positions = vectors->getPositions(); // of what does not move, in the new order
     compute.setAtomIndex(lastOrder);
     compute.setPosCellOffsets(lastOffsets);
@@ -256,7 +256,7 @@ template <class Host> void CommonRunDevice<Host>::restoreOrder() {
 }
 
 // Take note of what has become of the steps that were asked for.
-template <class Host> void CommonRunDevice<Host>::accept(const DeviceSteps::Report& report) {
+template <class Method> void CommonRunDevice<Method>::accept(const DeviceSteps::Report& report) {
     const bool areAllComplete = report.numSteps == numAsked;
     if (report.numSteps + 1 == reorderedStep)
         restoreOrder();
@@ -276,7 +276,7 @@ template <class Host> void CommonRunDevice<Host>::accept(const DeviceSteps::Repo
         hasForces = false;
 }
 
-template <class Host> void CommonRunDevice<Host>::settle() {
+template <class Method> void CommonRunDevice<Method>::settle() {
     while (numAsked > 0) {
         const int asked = numAsked;
         const DeviceSteps::Report report = steps->read();
@@ -309,7 +309,7 @@ template <class Host> void CommonRunDevice<Host>::settle() {
 }
 
 // What Forces have done before a step that has not happened.
-template <class Host> void CommonRunDevice<Host>::repeatActions() {
+template <class Method> void CommonRunDevice<Method>::repeatActions() {
     if (!reach.hasThermostat && !reach.movesFrame)
         return;
     actions.repeat();
@@ -320,7 +320,7 @@ template <class Host> void CommonRunDevice<Host>::repeatActions() {
 
 // ------------------------------------------------------------------------------------------------------ what has changed
 
-template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSettings& from) {
+template <class Method> void CommonRunDevice<Method>::setSettings(const IntegratorSettings& from) {
     if (isOnDevice)
         takeToHost();
     IntegratorSettings possible = from;
@@ -337,7 +337,7 @@ template <class Host> void CommonRunDevice<Host>::setSettings(const IntegratorSe
 }
 
 // The steps go on where they were.
-template <class Host> bool CommonRunDevice<Host>::setParameters(const vector<ExpressionConstraint>& given) {
+template <class Method> bool CommonRunDevice<Method>::setParameters(const vector<ExpressionConstraint>& given) {
     settle();
     const bool areOthers = Host::setParameters(given);
     if (areOthers)
@@ -345,14 +345,14 @@ template <class Host> bool CommonRunDevice<Host>::setParameters(const vector<Exp
     return areOthers;
 }
 
-template <class Host> void CommonRunDevice<Host>::setReferences(const vector<double>& references) {
+template <class Method> void CommonRunDevice<Method>::setFindings(const Findings& findings) {
     if (isOnDevice)
         takeToHost();
-    Host::setReferences(references);
+    Host::setFindings(findings);
     areSettingsOnDevice = false;
 }
 
-template <class Host> bool CommonRunDevice<Host>::updateState() {
+template <class Method> bool CommonRunDevice<Method>::updateState() {
     // What changes positions must not find those of a step that has failed. Another integrator may have let barostats act.
     if (reach.hasBarostat && (vectors->isSharedByIntegrators() || actions.isTrialNext()))
         settle();
@@ -368,7 +368,7 @@ template <class Host> bool CommonRunDevice<Host>::updateState() {
     }
 }
 
-template <class Host> RunDevice::Change CommonRunDevice<Host>::findChange() {
+template <class Method> RunDevice::Change CommonRunDevice<Method>::findChange() {
     if (!isOnDevice || reach.isUnknown)
         return Host::findChange();
     const bool mayBeOthers = haveActed;
@@ -388,25 +388,16 @@ template <class Host> RunDevice::Change CommonRunDevice<Host>::findChange() {
 }
 
 // The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
-template <class Host> double CommonRunDevice<Host>::getPositionRounding() const {
+template <class Method> double CommonRunDevice<Method>::getPositionRounding() const {
     return compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
 }
 
-template <class Host> bool CommonRunDevice<Host>::differ(const Vectors& a, const Vectors& b) {
-    const double tolerance = getPositionRounding();
-    for (size_t i = 0; i < masses.size(); i++)
-        for (int d = 0; d < 3; d++)
-            if (masses[i] > 0 && !(std::fabs(a[i][d] - b[i][d]) <= tolerance * std::max(1.0, std::fabs(a[i][d]))))
-                return true;
-    return false;
-}
-
-template <class Host> unsigned long long CommonRunDevice<Host>::getFingerprint() {
+template <class Method> unsigned long long CommonRunDevice<Method>::getFingerprint() {
     settle();
     return Host::getFingerprint();
 }
 
-template <class Host> void CommonRunDevice<Host>::start() {
+template <class Method> void CommonRunDevice<Method>::start() {
     settle();
     const bool wasOnDevice = isOnDevice, wasOnHost = isOnHost;
     if (!isOnHost)
@@ -426,7 +417,7 @@ template <class Host> void CommonRunDevice<Host>::start() {
     knownCount = vectors->getStepCount();
 }
 
-template <class Host> void CommonRunDevice<Host>::changeState() {
+template <class Method> void CommonRunDevice<Method>::changeState() {
     settle();
     if (!isOnDevice || !hasBegun) {
         takeToHost();
@@ -439,7 +430,7 @@ template <class Host> void CommonRunDevice<Host>::changeState() {
     settle();
 }
 
-template <class Host> void CommonRunDevice<Host>::changeForces() {
+template <class Method> void CommonRunDevice<Method>::changeForces() {
     settle();
     if (!isOnDevice || !hasBegun) {
         try {
@@ -462,7 +453,7 @@ template <class Host> void CommonRunDevice<Host>::changeForces() {
 }
 
 // Does not wait for the device where the next step is taken there.
-template <class Host> void CommonRunDevice<Host>::changeVelocities() {
+template <class Method> void CommonRunDevice<Method>::changeVelocities() {
     if (!isOnDevice || !hasBegun) {
         takeToHost();
         Host::changeVelocities();
@@ -472,7 +463,7 @@ template <class Host> void CommonRunDevice<Host>::changeVelocities() {
     changeOnDevice(Control::VelocitiesChanged);
 }
 
-template <class Host> void CommonRunDevice<Host>::changeOnDevice(Control::Change change) {
+template <class Method> void CommonRunDevice<Method>::changeOnDevice(Control::Change change) {
     steps->change(groupEnergy, change);
     knownCount = vectors->getStepCount();
     isChangePending = true;
@@ -480,7 +471,7 @@ template <class Host> void CommonRunDevice<Host>::changeOnDevice(Control::Change
 }
 
 // Of a change that no step has followed; where it has failed, the host will say why.
-template <class Host> void CommonRunDevice<Host>::resolveChange() {
+template <class Method> void CommonRunDevice<Method>::resolveChange() {
     isChangePending = false;
     const DeviceSteps::Report report = steps->read();
     hasBegun = hasReport = !report.hasFailed;
@@ -490,82 +481,91 @@ template <class Host> void CommonRunDevice<Host>::resolveChange() {
     state = lastReport.state;
 }
 
-template <class Host> void CommonRunDevice<Host>::writeVelocities() {
+template <class Method> void CommonRunDevice<Method>::writeVelocities() {
     settle();
     if (!isOnDevice)
         Host::writeVelocities();
 }
 
-template <class Host> void CommonRunDevice<Host>::reverse() {
+template <class Method> void CommonRunDevice<Method>::reverse() {
     takeToHost();
     Host::reverse();
 }
 
+template <class Method>
+void CommonRunDevice<Method>::tryOut(double stepSize, int count,
+                                     const std::function<void(const vector<double>&)>& look) {
+    takeToHost();
+    Host::tryOut(stepSize, count, look);
+}
+
 // ------------------------------------------------------------------------------------------------------------- numbers
 
-template <class Host> RunDevice::LastStep CommonRunDevice<Host>::getLastStep() {
+template <class Method> RunDevice::LastStep CommonRunDevice<Method>::getLastStep() {
     settle();
     return lastStep;
 }
 
-template <class Host> double CommonRunDevice<Host>::getTime() {
+template <class Method> double CommonRunDevice<Method>::getTime() {
     settle();
     return Host::getTime();
 }
 
-template <class Host> bool CommonRunDevice<Host>::readMonitorValues(vector<double>& values) {
+template <class Method> vector<double> CommonRunDevice<Method>::getMonitorValues() {
     settle();
     if (!isOnDevice || !hasBegun) {
         bringToHost();
-        return false;
+        return Host::getMonitorValues();
     }
     if (!hasReport)
         lastReport = steps->read();
     hasReport = true;
-    values = lastReport.values;
-    return true;
+    return lastReport.values;
 }
 
-template <class Host> vector<double> CommonRunDevice<Host>::getMultipliers() {
+template <class Method> vector<double> CommonRunDevice<Method>::getMultipliers() {
     bringToHost();
     return Host::getMultipliers();
 }
 
 // Which a run that pulls asks for in each step.
-template <class Host> double CommonRunDevice<Host>::getExpressionMultiplier(int index) {
+template <class Method> double CommonRunDevice<Method>::getExpressionMultiplier(int index) {
     settle();
     const bool isOthers = isOnDevice && hasBegun && !isOnHost;
     return isOthers ? steps->getExpressionMultipliers()[index] : Host::getExpressionMultiplier(index);
 }
 
-template <class Host> double CommonRunDevice<Host>::computeKineticEnergy() {
+template <class Method> double CommonRunDevice<Method>::computeKineticEnergy() {
     settle();
     ContextSelector selector(compute);
     return compute.getIntegrationUtilities().computeKineticEnergy(0);
 }
 
-template <class Host> long long CommonRunDevice<Host>::getNumSolverIterations() {
-    settle();
-    return Host::getNumSolverIterations() + (steps == nullptr ? 0 : steps->getNumIterations());
+template <class Method> double CommonRunDevice<Method>::computeHalfStepKineticEnergy() {
+    bringToHost();
+    return Host::computeHalfStepKineticEnergy();
 }
 
-template <class Host> long long CommonRunDevice<Host>::getNumDeviceRescues() {
+template <class Method> StepCounts CommonRunDevice<Method>::getCounts() {
     settle();
-    return numDeviceRescues;
+    StepCounts counts = Host::getCounts();
+    counts.solverIterations += steps == nullptr ? 0 : steps->getNumIterations();
+    counts.rescues += numDeviceRescues;
+    return counts;
 }
 
-template <class Host> const DeviceSteps::State* CommonRunDevice<Host>::findDeviceState() {
+template <class Method> const DeviceSteps::State* CommonRunDevice<Method>::findDeviceState() {
     settle();
     return isOnHost ? nullptr : &state;
 }
 
-template <class Host> void CommonRunDevice<Host>::save(RunState& run) {
+template <class Method> void CommonRunDevice<Method>::save(RunState& run) {
     bringToHost();
     Host::save(run);
 }
 
-template <class Host>
-bool CommonRunDevice<Host>::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
+template <class Method>
+bool CommonRunDevice<Method>::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
     settle();
     hasForces = false;
     correctMasses();
@@ -577,5 +577,5 @@ bool CommonRunDevice<Host>::resume(const RunState& run, const IntegratorSettings
     return true;
 }
 
-template class OpenMMVRattle::CommonRunDevice<HostVRattleDevice>;
-template class OpenMMVRattle::CommonRunDevice<HostLangevinDevice>;
+template class OpenMMVRattle::CommonRunDevice<VRattleRun>;
+template class OpenMMVRattle::CommonRunDevice<LangevinRun>;

@@ -8,7 +8,7 @@
 #include "ExpressionInfo.h"
 #include "ForceActions.h"
 #include "openmm/internal/ContextImpl.h"
-#include "run/RunDevice.h"
+#include "run/HostRunDevice.h"
 #include "run/RunState.h"
 #include <limits>
 #include <memory>
@@ -21,15 +21,15 @@ namespace OpenMMVRattle {
  * could not complete, trial runs, turning around, saving. The two hand the state over to each other. What the GPU cannot do is
  * done on the host throughout, such as constraints for which there are no kernels.
  *
- * What is particular to a method is in the classes derived from this one. Host is the method's device on the host.
+ * What is particular to a method is in the classes derived from this one.
  */
-template <class Host> class CommonRunDevice : public Host {
+template <class Method> class CommonRunDevice : public HostRunDevice<Method> {
 public:
     CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute, const OpenMM::Integrator& integrator,
                     const IntegratorSettings& settings);
     void setSettings(const IntegratorSettings& settings) override;
     bool setParameters(const std::vector<ExpressionConstraint>& given) override;
-    void setReferences(const std::vector<double>& references) override;
+    void setFindings(const Findings& findings) override;
     bool updateState() override;
     RunDevice::Change findChange() override;
     unsigned long long getFingerprint() override;
@@ -41,15 +41,18 @@ public:
     void step(double maxTime) override;
     void settle() override;
     void reverse() override;
+    void tryOut(double stepSize, int count, const std::function<void(const std::vector<double>&)>& look) override;
     RunDevice::LastStep getLastStep() override;
     double getTime() override;
+    std::vector<double> getMonitorValues() override;
     std::vector<double> getMultipliers() override;
     double getExpressionMultiplier(int index) override;
     double computeKineticEnergy() override;
     bool usesForcesOfOthers() override {
         return true;
     }
-    long long getNumSolverIterations() override;
+    double computeHalfStepKineticEnergy() override;
+    StepCounts getCounts() override;
     bool hasSteppedOnDevice() override {
         return hasStepped;
     }
@@ -57,6 +60,7 @@ public:
     bool resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) override;
 
 protected:
+    typedef HostRunDevice<Method> Host;
     typedef typename Host::Vectors Vectors;
     using Host::ahead;
     using Host::boxVectors;
@@ -70,15 +74,15 @@ protected:
     using Host::vectors;
     double computeForces() override;
     double getPositionRounding() const override;
-    bool differ(const Vectors& a, const Vectors& b) override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
     /** The settings in force, for the GPU. */
     virtual DeviceSteps::Settings makeDeviceSettings() = 0;
     /** What there is of the host's state beside positions, velocities and forces. */
     virtual DeviceSteps::State makeDeviceState() = 0;
-    /** Let the host go on with the state of the GPU. */
-    virtual void adopt(const typename Host::State& state, const DeviceSteps::State& others) = 0;
+    /** Let the host go on with the state of the GPU, an on-step state that satisfies the constraints. */
+    virtual void adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
+                       const DeviceSteps::State& others) = 0;
     /** Let the host know what a start depends on, though the state that it starts from is another. */
     virtual void carryOn(const DeviceSteps::State&) {
     }
@@ -90,13 +94,10 @@ protected:
     virtual int getMostStepsUntilLook() const {
         return std::numeric_limits<int>::max();
     }
-    /** The monitors on the GPU, if it is there that the state is. */
-    bool readMonitorValues(std::vector<double>& values);
     /** What the GPU has beside the monitors, if it is there that the state is; else null. */
     const DeviceSteps::State* findDeviceState();
     void bringToHost();
     void takeToHost();
-    long long getNumDeviceRescues();
 
 private:
     bool canStepOnDevice();

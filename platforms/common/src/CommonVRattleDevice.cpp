@@ -16,42 +16,38 @@ vector<double> referencesOf(const DeviceSteps::State& state) {
 
 } // namespace
 
-CommonVRattleDevice::CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
-                                         const OpenMM::Integrator& integrator, const IntegratorSettings& settings) :
-        CommonRunDevice(context, compute, integrator, settings) {
-}
-
 bool CommonVRattleDevice::canGoOnDevice() {
-    const vector<double> references = vrattle.getReferences();
+    const vector<double> references = method.getReferences();
     // Automatic step control finds its references on the way.
-    return vrattle.hasStarted() &&
-           (settings.isAutomatic ||
+    return method.hasStarted() &&
+           (method.getSettings().isAutomatic ||
             std::all_of(references.begin(), references.end(), [](double reference) { return reference > 0; }));
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
+    const StepSettings& settings = method.getSettings();
     DeviceSteps::Settings to = {
         settings.stepSize,  StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
         settings.update,    settings.isFixedStep,
         settings.tolerance, {}};
     to.isAutomatic = settings.isAutomatic;
     if (settings.isAutomatic) {
-        to.choice = vrattle.getAutomaticControl().getChoice();
-        to.numDegreesOfFreedom = vrattle.getAutomaticControl().getNumDegreesOfFreedom();
+        to.choice = method.getAutomaticControl().getChoice();
+        to.numDegreesOfFreedom = method.getAutomaticControl().getNumDegreesOfFreedom();
         return to;
     }
     to.terms = settings.terms;
-    const vector<double> references = vrattle.getReferences();
+    const vector<double> references = method.getReferences();
     for (size_t k = 0; k < to.terms.size(); k++)
         to.terms[k].reference = references[k];
     return to;
 }
 
 DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
-    const double halfStepValue = settings.isAutomatic ? 0.0 : vrattle.findHalfStepValue();
-    const VRattleRun::Memory memory = vrattle.getMemory();
+    const double halfStepValue = method.getSettings().isAutomatic ? 0.0 : method.findHalfStepValue();
+    const VRattleRun::Memory memory = method.getMemory();
     DeviceSteps::State state = {memory.rho, memory.densityOffset, memory.hasHalfStepValue, halfStepValue};
-    if (settings.isAutomatic) {
+    if (method.getSettings().isAutomatic) {
         state.automatic = memory.automatic;
         std::copy(memory.references.begin(), memory.references.end(), state.references);
     }
@@ -59,7 +55,7 @@ DeviceSteps::State CommonVRattleDevice::makeDeviceState() {
 }
 
 VRattleRun::Memory CommonVRattleDevice::memoryOf(const DeviceSteps::State& others) {
-    VRattleRun::Memory memory = vrattle.getMemory();
+    VRattleRun::Memory memory = method.getMemory();
     memory.hasDensity = true;
     memory.rho = others.density;
     memory.densityOffset = others.densityOffset;
@@ -70,46 +66,31 @@ VRattleRun::Memory CommonVRattleDevice::memoryOf(const DeviceSteps::State& other
     return memory;
 }
 
-void CommonVRattleDevice::adopt(const State& state, const DeviceSteps::State& others) {
-    vrattle.adopt(state.positions, state.velocities, state.forces, state.groupEnergy, getDeviceParameters(),
-                  memoryOf(others));
+void CommonVRattleDevice::adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
+                                double energy, const DeviceSteps::State& others) {
+    method.adopt(positions, velocities, forces, energy, getDeviceParameters(), memoryOf(others));
 }
 
 void CommonVRattleDevice::carryOn(const DeviceSteps::State& others) {
-    if (settings.isAutomatic)
-        vrattle.adopt(memoryOf(others));
+    if (method.getSettings().isAutomatic)
+        method.adopt(memoryOf(others));
 }
 
 // What a CMMotionRemover takes away is nothing to speak of for automatic step control, which would have to look at all velocities again.
 bool CommonVRattleDevice::doesFrameMatter() {
-    return !settings.isAutomatic && StepMonitor::useVelocities(settings.terms);
+    return !method.getSettings().isAutomatic && StepMonitor::useVelocities(method.getSettings().terms);
 }
 
-vector<double> CommonVRattleDevice::getReferences() {
-    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
-    return others != nullptr ? referencesOf(*others) : HostVRattleDevice::getReferences();
+Findings CommonVRattleDevice::getFindings() {
+    const DeviceSteps::State* others = method.getSettings().isAutomatic ? findDeviceState() : nullptr;
+    return others != nullptr ? Findings{referencesOf(*others), others->automatic.temperature, {}}
+                             : CommonRunDevice::getFindings();
 }
 
-double CommonVRattleDevice::getReferenceTemperature() {
-    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
-    return others != nullptr ? others->automatic.temperature : HostVRattleDevice::getReferenceTemperature();
-}
-
-long long CommonVRattleDevice::getNumShortSteps() {
-    const DeviceSteps::State* others = settings.isAutomatic ? findDeviceState() : nullptr;
-    return others != nullptr ? (long long) others->automatic.mostShortSteps : HostVRattleDevice::getNumShortSteps();
-}
-
-void CommonVRattleDevice::beginTrial(double stepSize, bool isBackwards) {
-    takeToHost();
-    HostVRattleDevice::beginTrial(stepSize, isBackwards);
-}
-
-vector<double> CommonVRattleDevice::getMonitorValues() {
-    vector<double> values;
-    return readMonitorValues(values) ? values : HostVRattleDevice::getMonitorValues();
-}
-
-long long CommonVRattleDevice::getNumRescues() {
-    return HostVRattleDevice::getNumRescues() + getNumDeviceRescues();
+StepCounts CommonVRattleDevice::getCounts() {
+    StepCounts counts = CommonRunDevice::getCounts();
+    const DeviceSteps::State* others = method.getSettings().isAutomatic ? findDeviceState() : nullptr;
+    if (others != nullptr)
+        counts.shortSteps = (long long) others->automatic.mostShortSteps;
+    return counts;
 }

@@ -5,27 +5,23 @@
 #define OPENMMVRATTLE_COMMONVRATTLEDEVICE_H_
 
 #include "CommonRunDevice.h"
-#include "run/HostVRattleDevice.h"
+#include "run/VRattleRun.h"
 
 namespace OpenMMVRattle {
 
 /** The device of VariableStepRattleIntegrator for OpenCL, CUDA and HIP. */
-class CommonVRattleDevice : public CommonRunDevice<HostVRattleDevice> {
+class CommonVRattleDevice : public CommonRunDevice<VRattleRun> {
 public:
-    CommonVRattleDevice(OpenMM::ContextImpl& context, OpenMM::ComputeContext& compute,
-                        const OpenMM::Integrator& integrator, const IntegratorSettings& settings);
-    std::vector<double> getReferences() override;
-    void beginTrial(double stepSize, bool isBackwards) override;
-    std::vector<double> getMonitorValues() override;
-    long long getNumRescues() override;
-    double getReferenceTemperature() override;
-    long long getNumShortSteps() override;
+    using CommonRunDevice::CommonRunDevice;
+    Findings getFindings() override;
+    StepCounts getCounts() override;
 
 protected:
     bool canGoOnDevice() override;
     DeviceSteps::Settings makeDeviceSettings() override;
     DeviceSteps::State makeDeviceState() override;
-    void adopt(const State& state, const DeviceSteps::State& others) override;
+    void adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
+               const DeviceSteps::State& others) override;
     void carryOn(const DeviceSteps::State& others) override;
     bool doesFrameMatter() override;
     VRattleRun::Memory memoryOf(const DeviceSteps::State& others);
