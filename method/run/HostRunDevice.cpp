@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "run/HostRunDevice.h"
+#include "constraints/StepFailure.h"
 #include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
@@ -113,7 +114,11 @@ HostRunDevice<Method>::HostRunDevice(std::unique_ptr<ContextVectors> vectors, co
 // -------------------------------------------------------------------------------------------------------- the settings
 
 template <class Method> void HostRunDevice<Method>::setSettings(const IntegratorSettings& from) {
-    method.takeSettings(from);
+    if (method.getConstraintSystem().getNumConstraints() == 0 && StepMonitor::needConstraints(from.terms))
+        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
+                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
+                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
+    method.setSettings(from);
     forceGroups = from.getActingForceGroups();
     monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
 }

@@ -122,7 +122,7 @@ void IntegratorRun::takeSettings() {
     if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups())
         task = Task::Start;
     // A start has met the tolerance that there was.
-    if (isAtStart && settings.constraintTolerance != applied.constraintTolerance)
+    if (isAtStart && settings.tolerance != applied.tolerance)
         task = Task::Start;
     applied = settings;
     areSettingsChanged = areValuesChanged = false;
@@ -301,7 +301,7 @@ vector<double> IntegratorRun::calibrate(int steps) {
     prepare(false);
     if (settings.isAutomatic)
         return findAutomaticReferences(steps);
-    vector<double> means(settings.monitors.size(), 0.0);
+    vector<double> means(settings.terms.size(), 0.0);
     try {
         device.tryOut(settings.stepSize, steps, [&](const vector<double>& values) {
             for (size_t k = 0; k < means.size(); k++)
@@ -375,7 +375,7 @@ double IntegratorRun::getReference(int index) {
 Findings IntegratorRun::getFindings() {
     Findings findings = device.getFindings();
     const bool haveSameUnits = std::equal(
-        settings.monitors.begin(), settings.monitors.end(), applied.monitors.begin(), applied.monitors.end(),
+        settings.terms.begin(), settings.terms.end(), applied.terms.begin(), applied.terms.end(),
         [](const StepMonitor::Term& a, const StepMonitor::Term& b) { return a.kind == b.kind && a.order == b.order; });
     if (!haveSameUnits || settings.isAutomatic != applied.isAutomatic)
         findings.references.assign(settings.getNumReferences(), 0.0);

@@ -9,34 +9,20 @@
 using namespace OpenMMVRattle;
 using OpenMM::OpenMMException;
 
-namespace {
-
-// The bounds' defaults as fractions of the nominal step size.
-const double DEFAULT_MINIMUM_FACTOR = 1.0 / 50.0;
-const double DEFAULT_MAXIMUM_FACTOR = 2.0;
-const double AUTOMATIC_MINIMUM_FACTOR = 1e-3; // of automatic step control
-
-} // namespace
-
-IntegratorSettings::IntegratorSettings(double stepSize) : stepSize(stepSize) {
-    monitors.push_back({StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0});
+IntegratorSettings::IntegratorSettings(double size) {
+    stepSize = size;
+    minimumStep = maximumStep = USE_DEFAULT;
+    calibrationSteps = DEFAULT_CALIBRATION_STEPS;
+    terms.push_back({StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0});
 }
 
-IntegratorSettings::IntegratorSettings(double stepSize, const LangevinSettings& langevin) :
-        stepSize(stepSize), isDefaultMonitor(false), langevin(langevin) {
-}
-
-double IntegratorSettings::getMinimumStep() const {
-    const double factor = isAutomatic ? AUTOMATIC_MINIMUM_FACTOR : DEFAULT_MINIMUM_FACTOR;
-    return minimumStep == USE_DEFAULT ? factor * stepSize : minimumStep;
-}
-
-double IntegratorSettings::getMaximumStep() const {
-    return maximumStep == USE_DEFAULT ? DEFAULT_MAXIMUM_FACTOR * stepSize : maximumStep;
+IntegratorSettings::IntegratorSettings(double size, const LangevinSettings& settings) :
+        isDefaultMonitor(false), langevin(settings) {
+    stepSize = size;
 }
 
 bool IntegratorSettings::usesMonitorForceGroup() const {
-    return std::any_of(monitors.begin(), monitors.end(),
+    return std::any_of(terms.begin(), terms.end(),
                        [](const StepMonitor::Term& term) { return term.kind == StepMonitor::ForceGroupEnergy; });
 }
 
@@ -46,7 +32,7 @@ int IntegratorSettings::getActingForceGroups() const {
 
 void IntegratorSettings::fitDefaultMonitor(bool hasConstraints) {
     if (isDefaultMonitor)
-        monitors[0].kind = hasConstraints ? StepMonitor::ConstraintMultipliers : StepMonitor::ConstraintAndAppliedForce;
+        terms[0].kind = hasConstraints ? StepMonitor::ConstraintMultipliers : StepMonitor::ConstraintAndAppliedForce;
 }
 
 bool IntegratorSettings::isConsistent() const {

@@ -5,10 +5,8 @@
 #define OPENMMVRATTLE_INTEGRATORSETTINGS_H_
 
 #include "expressions/ExpressionGroup.h"
-#include "step/AutomaticControl.h"
 #include "step/LangevinSettings.h"
-#include "step/StepDensity.h"
-#include "step/StepMonitor.h"
+#include "step/StepSettings.h"
 #include <optional>
 #include <vector>
 
@@ -16,31 +14,16 @@ namespace OpenMMVRattle {
 
 /**
  * Everything that a user has chosen of one of the integrators, as one value: what XML stores, copies share, saved runs
- * bring back and devices are given. Numbers that the run finds by itself are not in it.
+ * bring back and devices are given, the methods' own settings among it. Numbers that the run finds by itself are not in it.
  */
-struct IntegratorSettings {
-    static constexpr double USE_DEFAULT = -1;
+struct IntegratorSettings : StepSettings {
     static constexpr double DEFAULT_NORM_ORDER = 8;
     static constexpr int DEFAULT_CALIBRATION_STEPS = 30;
 
-    double stepSize = 0;               // the nominal step (ps); 0 where no step is to be taken
-    double minimumStep = USE_DEFAULT;  // bounds (ps), 0 for none; see getMinimumStep()
-    double maximumStep = USE_DEFAULT;
-    double constraintTolerance = 1e-8; // relative
-    StepDensity::Update update = StepDensity::SemiExplicit;
-    int forceGroups = -1;              // a bit for each group that acts, the monitor's perhaps among them
-
-    // A reference of 0 is taken at the first step. Nobody has chosen the default monitor, so it is made to fit the System.
-    std::vector<StepMonitor::Term> monitors;
-    bool isDefaultMonitor = true;
+    int forceGroups = -1;         // a bit for each group that acts, the monitor's perhaps among them
+    bool isDefaultMonitor = true; // nobody has chosen it, so it is made to fit the System
     int monitorForceGroup = 31;
     double normOrder = DEFAULT_NORM_ORDER; // of monitors that are added without one
-
-    // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
-    bool isAutomatic = false;
-    int calibrationSteps = DEFAULT_CALIBRATION_STEPS;
-    double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
-    int automaticRequest = 0; // changes when references in force are to be forgotten
 
     // Constant temperature, in place of all that varies the step.
     std::optional<LangevinSettings> langevin;
@@ -63,16 +46,13 @@ struct IntegratorSettings {
         if (langevin)
             langevin->randomSeed = seed;
     }
-    /** The bounds in force (ps), 0 for none; those that were not set follow the nominal step. */
-    double getMinimumStep() const;
-    double getMaximumStep() const;
     /** The number of values and references: of the monitors, of automatic step control, or U_ref at constant temperature. */
     int getNumReferences() const {
-        return langevin ? 1 : isAutomatic ? AutomaticControl::NUM_MONITORS : (int) monitors.size();
+        return langevin ? 1 : isAutomatic ? AutomaticControl::NUM_MONITORS : (int) terms.size();
     }
     /** The reference value that was set; 0 if there is none. */
     double& reference(int index) {
-        return langevin ? langevin->reference : isAutomatic ? automaticReferences[index] : monitors[index].reference;
+        return langevin ? langevin->reference : isAutomatic ? automaticReferences[index] : terms[index].reference;
     }
     double getReference(int index) const {
         return const_cast<IntegratorSettings*>(this)->reference(index);

@@ -9,8 +9,8 @@ using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
-void LangevinRun::takeSettings(const IntegratorSettings& from) {
-    setSettings({from.stepSize, from.constraintTolerance, *from.langevin});
+void LangevinRun::setSettings(const IntegratorSettings& from) {
+    LangevinDynamics::setSettings({from.stepSize, from.tolerance, *from.langevin});
 }
 
 void LangevinRun::beginFixedSteps(double) {

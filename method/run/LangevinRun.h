@@ -17,7 +17,7 @@ struct IntegratorSettings;
 class LangevinRun : public LangevinDynamics {
 public:
     using LangevinDynamics::LangevinDynamics;
-    void takeSettings(const IntegratorSettings& integrator);
+    void setSettings(const IntegratorSettings& integrator);
     /** Automatic step control and trial runs are not of this method. */
     double getNegligibleValue() const {
         return 0;

@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "run/VRattleRun.h"
-#include "constraints/StepFailure.h"
 #include "run/IntegratorSettings.h"
 #include <algorithm>
 #include <cmath>
@@ -17,27 +16,6 @@ namespace {
 const double TINY = 1e-100;
 
 } // namespace
-
-void VRattleRun::takeSettings(const IntegratorSettings& from) {
-    Settings to;
-    to.stepSize = from.stepSize;
-    to.minimumStep = from.stepSize > 0 ? from.getMinimumStep() : 0.0;
-    to.maximumStep = from.stepSize > 0 ? from.getMaximumStep() : 0.0;
-    to.tolerance = from.constraintTolerance;
-    to.update = from.update;
-    to.terms = from.monitors;
-    to.isFixedStep = false;
-    to.isAutomatic = from.isAutomatic;
-    to.automaticRequest = from.automaticRequest;
-    to.calibrationSteps = from.calibrationSteps;
-    if (from.isAutomatic)
-        std::copy(std::begin(from.automaticReferences), std::end(from.automaticReferences), to.automaticReferences);
-    if (getConstraintSystem().getNumConstraints() == 0 && StepMonitor::needConstraints(to.terms))
-        throw StepFailure("a monitor of the constraint forces is set (ConstraintMultipliers is the default) and the "
-                          "System has no constraints; choose a monitor of the applied forces, such as AppliedForce or "
-                          "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
-    setSettings(to);
-}
 
 StepCounts VRattleRun::getCounts() {
     StepCounts counts;
@@ -251,7 +229,7 @@ void VRattleRun::save(RunState& run) {
 }
 
 void VRattleRun::read(const RunState& run, const IntegratorSettings& saved, StepState& state, Memory& memory) {
-    exchange(state, memory, RunState::Archive(run), saved.isAutomatic ? 0 : saved.monitors.size(), saved.isAutomatic);
+    exchange(state, memory, RunState::Archive(run), saved.isAutomatic ? 0 : saved.terms.size(), saved.isAutomatic);
     const vector<double>& rates = state.theta.rates;
     state.theta.isMoving = std::any_of(rates.begin(), rates.end(), [](double rate) { return rate != 0; });
     state.w = run.halfStepVelocities;

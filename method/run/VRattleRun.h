@@ -35,8 +35,6 @@ public:
         constraints.share(count, task);
     }
 
-    /** Take over what of an integrator's settings is of the steps, but for the parameters of expressions. */
-    void takeSettings(const IntegratorSettings& integrator);
     const Settings& getSettings() const {
         return settings;
     }

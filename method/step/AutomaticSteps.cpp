@@ -32,8 +32,8 @@ bool AutomaticSteps::setSettings(const StepSettings& newSettings, bool isInForce
         control.setReference(k, reference);
     }
     const bool mustForget = mustBegin || newSettings.isFixedStep != settings.isFixedStep;
-    const bool goesOn =
-        !mustForget && newSettings.stepSize == settings.stepSize && newSettings.minimumStep == settings.minimumStep;
+    const bool goesOn = !mustForget && newSettings.stepSize == settings.stepSize &&
+                        newSettings.getMinimumStep() == settings.getMinimumStep();
     applySettings(newSettings);
     if (goesOn || now.q.empty())
         return true;
@@ -50,7 +50,7 @@ void AutomaticSteps::applySettings(const StepSettings& newSettings) {
     settings = newSettings;
     AutomaticControl::Settings own;
     own.stepSize = settings.stepSize;
-    own.minimumStep = settings.minimumStep;
+    own.minimumStep = settings.stepSize > 0 ? settings.getMinimumStep() : 0.0;
     own.learningSteps = settings.calibrationSteps;
     std::copy(std::begin(settings.automaticReferences), std::end(settings.automaticReferences), own.given);
     control.setSettings(own);

@@ -18,7 +18,7 @@ MonitorControl::MonitorControl(ConstraintSolver& constraints, StepSolver& solver
 
 void MonitorControl::applySettings(const StepSettings& newSettings) {
     settings = newSettings;
-    recursion = StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep);
+    recursion = settings.getDensity();
     monitor.setTerms(settings.terms, recursion);
 }
 
@@ -35,8 +35,9 @@ bool MonitorControl::setSettings(const StepSettings& newSettings, bool isInForce
         references.push_back(isTaken ? inForce[k] : given); // taken at the first step, and so it stays
     }
     const bool goesOn = areSameMonitors && references == inForce && newSettings.stepSize == settings.stepSize &&
-                        newSettings.minimumStep == settings.minimumStep &&
-                        newSettings.maximumStep == settings.maximumStep && newSettings.update == settings.update;
+                        newSettings.getMinimumStep() == settings.getMinimumStep() &&
+                        newSettings.getMaximumStep() == settings.getMaximumStep() &&
+                        newSettings.update == settings.update;
     const double oldU = areSameMonitors && hasDensity ? monitor.combine(now.values) : 0.0;
     applySettings(newSettings);
     setReferences(references);

@@ -6,27 +6,12 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "openmm/Vec3.h"
-#include "step/AutomaticControl.h"
+#include "step/StepSettings.h"
 #include "step/StepSolver.h"
 #include <string>
 #include <vector>
 
 namespace OpenMMVRattle {
-
-/** What a user can choose. */
-struct StepSettings {
-    double stepSize;                      // the nominal step h (ps)
-    double minimumStep, maximumStep;      // bounds (ps), 0 for none
-    double tolerance;                     // of the constraints, relative
-    StepDensity::Update update;
-    std::vector<StepMonitor::Term> terms; // a reference of 0 is taken at the first step
-    bool isFixedStep; // rho = 1 whatever the monitors say (a calibration run)
-    // Automatic step control, in place of monitors, update and maximum. A reference of 0 stands for the one in force.
-    bool isAutomatic = false;
-    double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
-    int automaticRequest = 0; // changes when references in force are to be forgotten
-    int calibrationSteps = 1; // how many steps the references are found from
-};
 
 /** What the density of the next step depends on, beside settings, references and the state. */
 struct StepMemory {

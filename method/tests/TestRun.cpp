@@ -295,7 +295,7 @@ void testSettings() {
     Example e;
     e.run.step(1);
     e.device.takeCalls();
-    e.settings.constraintTolerance = 1e-5;
+    e.settings.tolerance = 1e-5;
     e.run.settingsChanged();
     e.run.step(1); // no restart: the positions meet the tolerance that there was
     ASSERT_EQUAL(string("s+."), e.device.takeCalls());
@@ -303,7 +303,7 @@ void testSettings() {
     e.run.settingsChanged();
     e.run.step(1);
     ASSERT_EQUAL(string("sA+."), e.device.takeCalls());
-    e.settings.monitors[0].kind = StepMonitor::ForceGroupEnergy;
+    e.settings.terms[0].kind = StepMonitor::ForceGroupEnergy;
     e.settings.monitorForceGroup = 4;
     e.run.settingsChanged();
     e.run.step(1);

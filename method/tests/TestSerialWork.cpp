@@ -288,7 +288,7 @@ void testMonitors(const std::string& name, const Example& e, const vector<StepMo
             IntegratorSettings settings(0.001);
             settings.update = update;
             settings.isDefaultMonitor = false;
-            settings.monitors = {{kind, 1, 1, 0}};
+            settings.terms = {{kind, 1, 1, 0}};
             testSteps(name + ", monitor " + std::to_string(kind) + ", update " + std::to_string(update), e, settings,
                       maxAlone);
         }

@@ -80,7 +80,7 @@ bool hasConstraints(const OpenMM::System& system, const IntegratorSettings& sett
 ConstrainedIntegrator::ConstrainedIntegrator(const IntegratorSettings& given) :
         settings(std::make_unique<IntegratorSettings>(given)), lastSaved(0) {
     takeStepSize(given.stepSize);
-    Integrator::setConstraintTolerance(given.constraintTolerance);
+    Integrator::setConstraintTolerance(given.tolerance);
     Integrator::setIntegrationForceGroups(given.forceGroups);
 }
 
@@ -119,7 +119,7 @@ void ConstrainedIntegrator::settingsChanged() {
 void ConstrainedIntegrator::takeOver(const IntegratorSettings& newSettings) {
     *settings = newSettings;
     Integrator::setStepSize(settings->stepSize);
-    Integrator::setConstraintTolerance(settings->constraintTolerance);
+    Integrator::setConstraintTolerance(settings->tolerance);
     Integrator::setIntegrationForceGroups(settings->forceGroups);
     settingsChanged();
 }
@@ -141,7 +141,7 @@ void ConstrainedIntegrator::takeStepSize(double size) {
 void ConstrainedIntegrator::setConstraintTolerance(double tol) {
     requirePositive(tol, "constraint tolerance");
     Integrator::setConstraintTolerance(tol);
-    settings->constraintTolerance = tol;
+    settings->tolerance = tol;
     settingsChanged();
 }
 
@@ -381,7 +381,7 @@ void ConstrainedIntegrator::resume(const IntegratorSettings& saved, RunState& st
     if (!next.hasSameConstraints(previous)) // the constraints are those of the Context, their parameters the saved ones
         next.expressions = previous.expressions;
     next.fitDefaultMonitor(hasConstraints(context->getSystem(), next));
-    if (next.isDefaultMonitor && next.monitors[0].kind != saved.monitors[0].kind)
+    if (next.isDefaultMonitor && next.terms[0].kind != saved.terms[0].kind)
         state.findings.references.clear();
     run->requireUsable(state, next);
     takeOver(next);

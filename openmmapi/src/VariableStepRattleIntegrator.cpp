@@ -89,15 +89,14 @@ int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, do
     if (order != 0)
         requireOrder(order);
     settings->isAutomatic = settings->isDefaultMonitor = false;
-    settings->monitors.push_back(
-        {(StepMonitor::Kind) kind, weight, power, 0.0, order == 0 ? settings->normOrder : order});
+    settings->terms.push_back({(StepMonitor::Kind) kind, weight, power, 0.0, order == 0 ? settings->normOrder : order});
     settingsChanged();
-    return (int) settings->monitors.size() - 1;
+    return (int) settings->terms.size() - 1;
 }
 
 void VariableStepRattleIntegrator::clearMonitors() {
     settings->isAutomatic = settings->isDefaultMonitor = false;
-    settings->monitors.clear();
+    settings->terms.clear();
     settingsChanged();
 }
 
@@ -123,19 +122,19 @@ int VariableStepRattleIntegrator::getCalibrationSteps() const {
 }
 
 int VariableStepRattleIntegrator::getNumMonitors() const {
-    return (int) settings->monitors.size();
+    return (int) settings->terms.size();
 }
 
 void VariableStepRattleIntegrator::getMonitor(int index, MonitorKind& kind, double& weight, double& power) const {
     checkMonitorIndex(index);
-    kind = (MonitorKind) settings->monitors[index].kind;
-    weight = settings->monitors[index].weight;
-    power = settings->monitors[index].power;
+    kind = (MonitorKind) settings->terms[index].kind;
+    weight = settings->terms[index].weight;
+    power = settings->terms[index].power;
 }
 
 double VariableStepRattleIntegrator::getMonitorNormOrder(int index) const {
     checkMonitorIndex(index);
-    return settings->monitors[index].order;
+    return settings->terms[index].order;
 }
 
 int VariableStepRattleIntegrator::getMonitorForceGroup() const {
@@ -158,7 +157,7 @@ double VariableStepRattleIntegrator::getNormOrder() const {
 void VariableStepRattleIntegrator::setNormOrder(double order) {
     requireOrder(order);
     settings->normOrder = order;
-    for (StepMonitor::Term& monitor : settings->monitors)
+    for (StepMonitor::Term& monitor : settings->terms)
         monitor.order = order;
     settingsChanged();
 }

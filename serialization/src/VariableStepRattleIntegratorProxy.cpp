@@ -39,14 +39,14 @@ void VariableStepRattleIntegratorProxy::serialize(const void* object, Serializat
         node.setDoubleProperty(MINIMUM_STEP, settings.minimumStep);
     if (settings.maximumStep != IntegratorSettings::USE_DEFAULT)
         node.setDoubleProperty(MAXIMUM_STEP, settings.maximumStep);
-    node.setDoubleProperty("constraintTolerance", settings.constraintTolerance);
+    node.setDoubleProperty("constraintTolerance", settings.tolerance);
     node.setIntProperty("integrationForceGroups", settings.forceGroups);
     node.setIntProperty("updateMethod", settings.update);
     node.setDoubleProperty("normOrder", settings.normOrder);
     node.setIntProperty("monitorForceGroup", settings.monitorForceGroup);
     SerializationNode& monitors = node.createChildNode("Monitors");
     monitors.setBoolProperty("areDefault", settings.isDefaultMonitor);
-    for (const StepMonitor::Term& monitor : settings.monitors)
+    for (const StepMonitor::Term& monitor : settings.terms)
         monitors.createChildNode("Monitor")
             .setIntProperty("kind", monitor.kind)
             .setDoubleProperty("weight", monitor.weight)

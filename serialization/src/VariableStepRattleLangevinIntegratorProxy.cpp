@@ -29,7 +29,7 @@ void VariableStepRattleLangevinIntegratorProxy::serialize(const void* object, Se
     const IntegratorSettings& settings = *static_cast<const VariableStepRattleLangevinIntegrator*>(object)->settings;
     node.setIntProperty("version", VERSION);
     node.setDoubleProperty("stepSize", settings.stepSize);
-    node.setDoubleProperty("constraintTolerance", settings.constraintTolerance);
+    node.setDoubleProperty("constraintTolerance", settings.tolerance);
     node.setIntProperty("integrationForceGroups", settings.forceGroups);
     node.setDoubleProperty("temperature", settings.langevin->temperature);
     node.setDoubleProperty("friction", settings.langevin->friction);

@@ -324,13 +324,13 @@ template <class Method> void CommonRunDevice<Method>::setSettings(const Integrat
     if (isOnDevice)
         takeToHost();
     IntegratorSettings possible = from;
-    possible.constraintTolerance = DeviceSteps::tolerableTolerance(compute, from.constraintTolerance);
+    possible.tolerance = DeviceSteps::tolerableTolerance(compute, from.tolerance);
     static bool hasWarned = false;
-    if (possible.constraintTolerance > from.constraintTolerance && !hasWarned) {
+    if (possible.tolerance > from.tolerance && !hasWarned) {
         hasWarned = true;
-        std::cerr << from.getIntegratorName() << ": the constraint tolerance " << from.constraintTolerance
-                  << " is below what the precision of this Context allows; " << possible.constraintTolerance
-                  << " is used" << std::endl;
+        std::cerr << from.getIntegratorName() << ": the constraint tolerance " << from.tolerance
+                  << " is below what the precision of this Context allows; " << possible.tolerance << " is used"
+                  << std::endl;
     }
     Host::setSettings(possible);
     areSettingsOnDevice = false;

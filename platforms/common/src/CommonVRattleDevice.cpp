@@ -26,10 +26,8 @@ bool CommonVRattleDevice::canGoOnDevice() {
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
     const StepSettings& settings = method.getSettings();
-    DeviceSteps::Settings to = {
-        settings.stepSize,  StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
-        settings.update,    settings.isFixedStep,
-        settings.tolerance, {}};
+    DeviceSteps::Settings to = {settings.stepSize,    settings.getDensity(), settings.update,
+                                settings.isFixedStep, settings.tolerance,    {}};
     to.isAutomatic = settings.isAutomatic;
     if (settings.isAutomatic) {
         to.choice = method.getAutomaticControl().getChoice();
