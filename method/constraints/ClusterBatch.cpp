@@ -3,10 +3,10 @@
 
 #include "constraints/ClusterBatch.h"
 #include "constraints/Pack.h"
+#include "constraints/Sum.h"
 #include "constraints/Wide.h"
 #include <algorithm>
 #include <array>
-#include <cmath>
 #include <limits>
 #include <map>
 #include <tuple>
@@ -16,9 +16,6 @@ using OpenMM::Vec3;
 using std::vector;
 
 namespace {
-
-// A cluster that has not converged after so many iterations with one matrix is left to Newton's iteration.
-const int MAX_ITERATIONS = 12;
 
 /** Bonds from particle 0 to each of the others: a diatomic, or CH_n. */
 template <int NumBonds> struct Star {
@@ -123,10 +120,10 @@ public:
     int getFirstConstraint(int cluster) const override {
         return firstConstraint + cluster * B;
     }
-    double solvePositions(const StepArrays& step, int first, int end, double tolerance,
-                          int& iterations) const override {
-        return hasWideVectors() ? solveWide(step, first, end, tolerance, iterations)
-                                : solve(step, first, end, tolerance, iterations);
+    double solvePositions(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+                          int& numUpdates) const override {
+        return hasWideVectors() ? solveWide(step, first, end, iteration, numUpdates)
+                                : solve(step, first, end, iteration, numUpdates);
     }
     double coupledPass(const StepArrays& step, int first, int end) const override {
         return hasWideVectors() ? passWide(step, first, end) : pass(step, first, end);
@@ -136,10 +133,10 @@ public:
     }
 
 private:
-    double solve(const StepArrays& step, int first, int end, double tolerance, int& iterations) const;
-    OPENMMVRATTLE_WIDE double solveWide(const StepArrays& step, int first, int end, double tolerance,
-                                        int& iterations) const {
-        return solve(step, first, end, tolerance, iterations);
+    double solve(const StepArrays& step, int first, int end, const ChordIteration& iteration, int& numUpdates) const;
+    OPENMMVRATTLE_WIDE double solveWide(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+                                        int& numUpdates) const {
+        return solve(step, first, end, iteration, numUpdates);
     }
     double pass(const StepArrays& step, int first, int end) const;
     OPENMMVRATTLE_WIDE double passWide(const StepArrays& step, int first, int end) const {
@@ -221,20 +218,14 @@ private:
     static PackVector bondOf(const PackVector* x, int k) {
         return x[Topology::first(k)] - x[Topology::second(k)];
     }
-    static void keepLargest(double& largest, Pack x) {
-        for (int lane = 0; lane < PACK_SIZE; lane++) {
-            double size = std::fabs(x[lane]);
-            if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
-                largest = size;
-        }
-    }
     /** The largest size of some numbers, or a NaN if there is one. */
     static double largestOf(const Pack* x) {
         Pack largest = packOf(0);
         for (int k = 0; k < B; k++)
             largest = largerSize(largest, x[k]);
         double result = 0;
-        keepLargest(result, largest);
+        for (int lane = 0; lane < PACK_SIZE; lane++)
+            result = largerOf(result, largest[lane]);
         return result;
     }
 
@@ -290,11 +281,8 @@ template <class Topology>
 void BatchOf<Topology>::keepSmallestPivot(const Shape& shape, const Factor& factor, double& smallest) {
     for (int k = 0; k < B; k++) {
         Pack inverse = factor.inversePivot[k] * shape.massCoupling[k][k] * dot(factor.row[k], factor.row[k]);
-        for (int lane = 0; lane < PACK_SIZE; lane++) {
-            double relative = 1 / inverse[lane];
-            if (relative < smallest || std::isnan(relative))
-                smallest = relative;
-        }
+        for (int lane = 0; lane < PACK_SIZE; lane++)
+            smallest = smallerOf(smallest, 1 / inverse[lane]);
     }
 }
 
@@ -361,7 +349,8 @@ void BatchOf<Topology>::addConstraintForces(const Shape& shape, const Factor& fa
 }
 
 template <class Topology>
-double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, double tolerance, int& iterations) const {
+double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+                                int& numUpdates) const {
     const Pack kick = packOf(step.kick), drift = packOf(step.drift);
     const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
     double worst = 0;
@@ -387,29 +376,25 @@ double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, doub
             lambda[k] = load(lanes, k, step.lambda);
         NewtonFactor factor;
         double error = 0, previous = std::numeric_limits<double>::infinity();
-        int iteration = 0;
+        int updates = 0;
         while (true) {
             for (int k = 0; k < B; k++)
                 next[k] = unconstrained[k];
             addConstraintBonds(shape, rows, lambda, scale, next);
             evaluate(shape, next, g);
             error = largestOf(g);
-            // Where the error is no longer reduced it is rounding, or the caller's to deal with.
-            if (iteration > 0 && (error <= tolerance || !(error < 0.5 * previous)))
+            if (iteration.isOver(updates, error, previous))
                 break;
-            if (iteration == MAX_ITERATIONS)
-                break;
-            if (iteration == 0)
+            if (updates == 0)
                 factorizeNewton(shape, next, rows, factor);
             solve(factor, g);
             for (int k = 0; k < B; k++)
                 lambda[k] += g[k] * inverseScale;
             previous = error;
-            iteration++;
+            updates++;
         }
-        iterations = std::max(iterations, iteration);
-        if (error > worst || std::isnan(error))
-            worst = error;
+        numUpdates = std::max(numUpdates, updates);
+        worst = largerOf(worst, error);
         addConstraintForces(shape, rows, lambda, -kick, w);
         for (int i = 0; i < P; i++) {
             store(lanes, i, w[i], step.wNext);
@@ -447,8 +432,7 @@ template <class Topology> double BatchOf<Topology>::pass(const StepArrays& step,
         }
         addConstraintBonds(shape, factor, lambda, scale, next);
         evaluate(shape, next, g);
-        for (int k = 0; k < B; k++)
-            keepLargest(worst, g[k]);
+        worst = largerOf(worst, largestOf(g));
         // Lambda(q, p+) = K^-1 (g''(w+,w+) + G M^-1 F)
         for (int k = 0; k < B; k++) {
             const PackVector velocity = (next[k] - r[k]) * inverseDrift;

@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_CLUSTERBATCH_H_
 #define OPENMMVRATTLE_CLUSTERBATCH_H_
 
+#include "constraints/ChordIteration.h"
 #include "constraints/ClusterLayout.h"
 #include "openmm/Vec3.h"
 #include <memory>
@@ -64,12 +65,11 @@ public:
      * Solve g(q+) = 0 for the clusters first, ..., end - 1 (first is a multiple of PACK_SIZE) by Newton's iteration with the matrix of
      * the guess, each pack of clusters as often as it needs.
      *
-     * @param tolerance    stop where the largest |g| of the cluster is this small, after at least one update
-     * @param[in,out] iterations    the number of updates of the cluster that needed most
+     * @param[in,out] numUpdates    the number of updates of the cluster that needed most
      * @return the largest |g| left; larger than the tolerance, or a NaN, if a cluster did not converge quickly
      */
-    virtual double solvePositions(const StepArrays& step, int first, int end, double tolerance,
-                                  int& iterations) const = 0;
+    virtual double solvePositions(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+                                  int& numUpdates) const = 0;
     /**
      * One pass of the coupled iteration: lambda += change, the positions and velocities from it, Lambda(q, p+), and the next
      * change.

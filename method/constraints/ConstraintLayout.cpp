@@ -184,6 +184,7 @@ void ConstraintSystem::findParts(const vector<ClusterLayout::Cluster>& general) 
         beginNext();
     }
     closePart();
+    numParts = open.index;
 }
 
 // The expressions of each part by their groups.

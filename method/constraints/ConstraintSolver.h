@@ -95,7 +95,9 @@ public:
         virtual void seeConstraints(int, int, int) {
         }
     };
-    int getNumRanges() const;
+    int getNumRanges() const {
+        return getNumBatchRanges() + system.getNumParts();
+    }
     /**
      * Whether velocities are others seen from a uniformly moving frame, but for rounding, and constraints know nothing of that.
      *
@@ -153,12 +155,14 @@ public:
     /** Lambda(q,p) = K^-1 (g''(v,v) + G M^-1 F) (4.3) for any velocities; rightSide is K Lambda. */
     void findMultipliers(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& multipliers,
                          std::vector<double>& rightSide);
-    /** v -= M^-1 G^T K^-1 G v, the nearest velocities along the constraints. */
-    void projectVelocities(Vectors& v);
-    /** How K Lambda changes with the logarithm of the rates dtheta/dt, all of which grow by the same factor. */
-    void findChangeWithRates(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& result) const;
     /** result -= M^-1 G^T K^-1 (G v + dg/dtheta . dtheta/dt): what brings v to where parameters that move want it. */
     void addProjection(const Vectors& v, const ExpressionParameters& theta, Vectors& result);
+    /** v -= M^-1 G^T K^-1 G v, the nearest velocities along constraints whose parameters are at rest. */
+    void projectVelocities(Vectors& v) {
+        addProjection(v, ExpressionParameters(), v);
+    }
+    /** How K Lambda changes with the logarithm of the rates dtheta/dt, all of which grow by the same factor. */
+    void findChangeWithRates(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& result) const;
     /** result += scale M^-1 G^T x */
     void addTransposedOverMass(const std::vector<double>& x, double scale, Vectors& result);
     /** result = G M^-1 f */
@@ -305,7 +309,10 @@ private:
     struct CoupledPass;
     struct FinishPass;
     int rangeOf(const Part& part) const {
-        return (int) ((system.getBlocks().size() - 1) * system.getBatches().size()) + part.index;
+        return getNumBatchRanges() + part.index;
+    }
+    int getNumBatchRanges() const {
+        return (int) ((system.getBlocks().size() - 1) * system.getBatches().size());
     }
     template <class Task> void forRangesOfBlock(int block, const Task& task) const {
         const auto& batches = system.getBatches();
@@ -329,6 +336,7 @@ private:
     void guess(const Trial& trial, const Guess& guess, int first, int end) const;
     bool solveByNewton(const Trial& trial, const Guess& guess);
     bool iterateNewton(const Trial& trial);
+    void solveLinearized(std::vector<double>& x, double scale) const;
     bool projectByChord(const ExpressionParameters& theta, Vectors& positions);
     bool projectByNewton(const ExpressionParameters& theta, Vectors& positions);
     std::string explain(const Vectors& from, const ExpressionParameters& theta, const Vectors& displacement,
@@ -354,7 +362,6 @@ private:
     ConstraintSystem::Jacobian jacobianNext, velocityJacobian;
     std::vector<double> appliedTermNext, residual, correction, before;
     Vectors acceleration;
-    bool hasCorrection; // whether the next coupledPass() has one to apply
     std::vector<double> rangeResults;
     std::vector<char> isPieceEliminated; // whether the matrix has begun to solve for the unknowns of a piece
 };

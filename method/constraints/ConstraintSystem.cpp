@@ -3,6 +3,7 @@
 
 #include "constraints/ConstraintSystem.h"
 #include "constraints/StepFailure.h"
+#include "constraints/Sum.h"
 #include <algorithm>
 #include <cmath>
 #include <map>
@@ -229,18 +230,14 @@ const ConstraintSystem::ExpressionRow& ConstraintSystem::findRow(int constraint)
 double ConstraintSystem::evaluate(const vector<Vec3>& q, const ExpressionParameters& theta, vector<double>& g,
                                   const Jacobian& nearby, const Part& part) const {
     double largest = 0;
-    auto keepLargest = [&](double size) {
-        if (size > largest || std::isnan(size)) // a NaN stays, since nothing is larger
-            largest = size;
-    };
     forDistances(part, [&](int k) {
         Vec3 r = q[constraints[k].particle1] - q[constraints[k].particle2];
         double length = constraints[k].length;
         g[k] = 0.5 * (r.dot(r) - length * length) * inverseSquareLengths[k];
-        keepLargest(std::fabs(g[k]));
+        largest = largerOf(largest, std::fabs(g[k]));
     });
     forGroups(part, [&](const ExpressionGroup& group, int first, int end) { group.evaluate(q, theta, g, first, end); });
-    forRows(part, [&](const ExpressionRow& row) { keepLargest(findErrorOf(row, g, nearby)); });
+    forRows(part, [&](const ExpressionRow& row) { largest = largerOf(largest, findErrorOf(row, g, nearby)); });
     return largest;
 }
 

@@ -214,6 +214,10 @@ public:
     const std::vector<Part>& getWholeParts() const {
         return wholeParts;
     }
+    /** The number of all parts: their indices are less than this. */
+    int getNumParts() const {
+        return numParts;
+    }
     /** The pieces of all large clusters. */
     const std::vector<Part>& getPieces() const {
         return pieces;
@@ -338,7 +342,7 @@ private:
     template <class Copy> void forParameters(const Copy& copy) const;
     const ExpressionRow& findRow(int constraint) const;
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
-    int numGivenConstraints, numGivenDistances, firstGeneral;
+    int numGivenConstraints, numGivenDistances, firstGeneral, numParts;
     std::vector<double> masses;
     ClusterLayout layout;
     const std::vector<double>& inverseMasses;

@@ -7,10 +7,10 @@
 #include "constraints/ClusterBatch.h"
 #include "constraints/ConstraintMatrix.h"
 #include "constraints/ConstraintSystem.h"
+#include "constraints/Sum.h"
 #include "constraints/ThreadChoice.h"
 #include <algorithm>
 #include <chrono>
-#include <cmath>
 #include <exception>
 #include <functional>
 #include <limits>
@@ -35,13 +35,13 @@ public:
         int iterations = 0, batchIterations = 0, failed = ConstraintMatrix::REGULAR;
         std::exception_ptr exception; // that ended a thread's share
         void addError(double other) {
-            error = larger(error, other);
+            error = largerOf(error, other);
         }
         void addPieceError(double other) {
-            pieceError = larger(pieceError, other);
+            pieceError = largerOf(pieceError, other);
         }
         void addPivot(double other) {
-            pivot = -larger(-pivot, -other);
+            pivot = smallerOf(pivot, other);
         }
         void addFailed(int other) {
             failed = std::max(failed, other);
@@ -131,11 +131,6 @@ public:
     template <class JointTask> void runOnJoints(const JointTask& task) const {
         for (const ConstraintSystem::CutCluster& cluster : system.getCutClusters())
             task(cluster);
-    }
-
-    /** The larger of two numbers, or a NaN if one is. */
-    static double larger(double a, double b) {
-        return a >= b || std::isnan(a) ? a : b;
     }
 
 private:

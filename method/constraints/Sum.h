@@ -4,7 +4,17 @@
 #ifndef OPENMMVRATTLE_SUM_H_
 #define OPENMMVRATTLE_SUM_H_
 
+#include <cmath>
+
 namespace OpenMMVRattle {
+
+/** The larger, or the smaller, of two numbers, or a NaN if one is. */
+inline double largerOf(double a, double b) {
+    return a >= b || std::isnan(a) ? a : b;
+}
+inline double smallerOf(double a, double b) {
+    return a <= b || std::isnan(a) ? a : b;
+}
 
 /**
  * The sum of term(0), ..., term(count - 1) in four interleaved parts: a processor waits for each addition to one number, and adds to
