@@ -1,9 +1,9 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// The behaviours that OpenMM's own tests check of LangevinMiddleIntegrator, checked of VariableStepRattleLangevinIntegrator. Random
-// numbers depend on the seed and the step alone, so what is a sample here is the same one on all platforms. Each platform's tests/
-// includes this file.
+// The behaviours that OpenMM's own tests check of LangevinMiddleIntegrator, case by case those of tests/TestLangevinMiddleIntegrator.h
+// of OpenMM 8.6, checked of VariableStepRattleLangevinIntegrator. Random numbers depend on the seed and the step alone, so what is a
+// sample here is the same one on all platforms. Each platform's tests/ includes this file.
 
 #include "BehaviourSystems.h"
 #include "TestSupport.h"

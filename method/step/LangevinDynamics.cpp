@@ -83,8 +83,8 @@ void LangevinDynamics::setSettings(const Settings& newSettings) {
     else if (reference > 0 && !settings.langevin.isReferenceFrozen) {
         // The floor of smaller steps is no reference for large ones, which would be blind until it has fallen.
         if (isStepNew)
-            reference = std::min(reference, std::max(LARGEST_START * findFloor(COLDEST), values[0]));
-        reference = std::max(reference, findFloor(COLDEST));
+            reference = std::min(reference, std::max(LARGEST_START * findFloor(), values[0]));
+        reference = std::max(reference, findFloor());
     }
 }
 
@@ -109,7 +109,7 @@ double LangevinDynamics::findFloor(double coldest) const {
 
 void LangevinDynamics::startReference() {
     if (reference == 0)
-        reference = std::max(findFloor(COLDEST), std::min(values[0], LARGEST_START * findFloor(COLDEST)));
+        reference = std::max(findFloor(), std::min(values[0], LARGEST_START * findFloor()));
 }
 
 double LangevinDynamics::getFollowingFactor() const {
@@ -262,7 +262,6 @@ void LangevinDynamics::adopt(const Vectors& positions, const Vectors& velocities
     v = velocities; // which have been projected, and so changed in the last bits
     reference = newReference;
     numDrawn = drawn;
-    doublings = 0;
     if (!isFollowed)
         followReference();
 }

@@ -40,8 +40,8 @@ namespace OpenMMVRattle {
  *     A_c = sum_{i in c} (|f_i|^2/m_i + |f_i| |v_i|^2/l),   U = (sum_c A_c^4)^(1/8),
  *
  * and k is the smallest number with 2^k >= (U/U_ref)^(2/3)/c. U_ref follows U as a running median at a bounded rate, but not in
- * substepped steps hotter than thermal motion can be: so a clash does not capture it, and no calibration is needed. docs/langevin.md
- * has the reasons.
+ * substepped steps hotter than thermal motion can be: so a clash does not capture it, and no calibration is needed.
+ * docs/langevin_method.md has the reasons.
  *
  * Each substep is a pass of step() and finish(). All that a run asks of a method has the same meaning as in VRattleDynamics.
  */
