@@ -244,13 +244,59 @@ def test_what_the_user_has_set_to_nan_is_said() -> None:
     broken = positions_of(run.context)
     broken[2, 0] = math.nan
     run.context.setPositions(broken)
-    with pytest.raises(openmm.OpenMMException, match="no step can be taken, as positions, velocities or forces"):
+    with pytest.raises(openmm.OpenMMException, match="the position of particle 2 is not a finite number"):
         run.integrator.step(5)
     assert run.context.getStepCount() == 5
     assert np.isnan(positions_of(run.context)[2, 0])
     run.context.setPositions(chain().positions)
     run.integrator.step(5)
     assert run.context.getStepCount() == 10
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_system_that_reinitialize_brings_is_looked_at(settings: str, keeps: bool) -> None:
+    """Masses that are negative, and lengths of constraints that are others."""
+    run = Run(SETTINGS[settings])
+    run.integrator.step(20)
+    system = run.context.getSystem()
+    system.setParticleMass(4, -1.008)
+    run.context.reinitialize(preserveState=keeps)
+    if not keeps:
+        run.context.setPositions(chain().positions)
+    before = positions_of(run.context)
+    with pytest.raises(openmm.OpenMMException, match=r"the mass of particle 4 is -1.008 amu"):
+        run.integrator.step(5)
+    np.testing.assert_array_equal(positions_of(run.context), before)
+    system.setParticleMass(4, 12.0)
+    for k in range(system.getNumConstraints()):
+        i, j, length = system.getConstraintParameters(k)
+        system.setConstraintParameters(k, i, j, 1.002 * length)
+    run.context.reinitialize(preserveState=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConstraintWarning)
+        run.integrator.step(30)  # which looks after ten of them
+    assert constraint_error(system, positions_of(run.context)) < 1e-3
+
+
+def test_an_overlap_is_named() -> None:
+    """Two particles so close that the first step leads to what is no number, and two at the same place."""
+    system = openmm.System()
+    force = openmm.CustomNonbondedForce("r^(-40)")
+    for _ in range(5):
+        system.addParticle(10.0)
+        force.addParticle()
+    system.addForce(force)
+    positions = np.arange(15.0).reshape(5, 3)
+    cases = {1e-5: "the largest force there, .* is on particle 1", 0.0: "the force on particle 1 is infinite"}
+    for distance, words in cases.items():
+        positions[3] = positions[1] + [distance, 0, 0]
+        integrator = Custom(0.001)
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatform("Reference"))
+        context.setPositions(positions)
+        with pytest.raises(openmm.OpenMMException, match=words):
+            integrator.step(1)
+        np.testing.assert_array_equal(positions_of(context), positions)
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])  # CPU raises an exception of its own

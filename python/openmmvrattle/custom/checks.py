@@ -52,6 +52,32 @@ def require_sound_start(context: openmm.Context) -> None:
         _require_whole_molecules(system, positions, box)
 
 
+def explain_not_finite(context: openmm.Context) -> str:
+    """What of a state is not finite, by the first particle."""
+    system, state = context.getSystem(), context.getState(positions=True, velocities=True)
+    for name, values in (
+        ("position", state.getPositions(asNumpy=True)._value),
+        ("velocity", state.getVelocities(asNumpy=True)._value),
+    ):
+        for i in np.flatnonzero(~np.isfinite(values).all(axis=1)):
+            if system.getParticleMass(int(i))._value > 0:
+                return f"the {name} of particle {i} is not a finite number: set another"
+    return f"forces are not finite, and {explain_largest_force(context)}; move apart what overlaps"
+
+
+def explain_largest_force(context: openmm.Context, groups: int = -1) -> str:
+    """Which particle the largest force acts on, where overlaps are to be looked for."""
+    try:
+        forces = context.getState(forces=True, groups=groups).getForces(asNumpy=True)._value
+    except openmm.OpenMMException as failure:  # of a platform that looks for what is no number
+        return str(failure)
+    infinite = np.flatnonzero(~np.isfinite(forces).all(axis=1))
+    if len(infinite):
+        return f"the force on particle {infinite[0]} is infinite or not a number"
+    sizes = np.linalg.norm(forces, axis=1)
+    return f"the largest force there, {np.max(sizes):.2g} kJ/mol/nm, is on particle {np.argmax(sizes)}"
+
+
 def _uses_box(system: openmm.System) -> bool:
     try:
         return bool(system.usesPeriodicBoundaryConditions())

@@ -18,7 +18,7 @@ import openmm
 from openmm import unit
 
 from .._arguments import integer, monitor_arguments, number
-from .checks import require_sound_start
+from .checks import explain_largest_force, explain_not_finite, require_masses, require_sound_start
 from .program import KEPT, make_program
 from .run import Run, find_context, positions_of, redundant_constraints, vectors, velocities_of
 from .settings import (
@@ -708,7 +708,9 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
                     raise error("this integrator is not bound to a Context")
                 return None
             self.attachContext(context)
-            run = self._run
+        elif not self._get("started"):  # the System may be another, by Context.reinitialize()
+            self.attachContext(run.context)
+        run = self._run
         if self._get("conflict"):
             raise error(str(self._settings().conflict()))
         time = run.context.getTime()._value
@@ -780,7 +782,8 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
             self._set("skipped", 0.0)
             context.setStepCount(context.getStepCount() - skipped)
             if skipped == steps:  # what was found at the beginning is not the result of a step of ours
-                raise error("no step can be taken, as positions, velocities or forces are not finite")
+                require_masses(context.getSystem())
+                raise error(f"no step can be taken, as {explain_not_finite(context)}")
         elif math.isfinite(self._get("total")):
             return
         self._undo(context, self._kept())
@@ -789,10 +792,15 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
 
     def _explain_not_finite(self, context: openmm.Context) -> str:
         """Of a step that has been undone."""
+        groups = self.getIntegrationForceGroups()
         return (
             "a step could not be taken, as forces, monitors or the constraint solver gave numbers that are not finite; "
             "the Context is in the state before this step: "
-            + (redundant_constraints(context.getSystem(), positions_of(context)) or "take a smaller nominal step size")
+            + (
+                redundant_constraints(context.getSystem(), positions_of(context))
+                or f"{explain_largest_force(context, groups)}; take a smaller nominal step size, or move apart what "
+                "overlaps"
+            )
         )
 
     def _kept(self) -> dict[str, float]:

@@ -188,7 +188,8 @@ def _notice_changes(program: Program) -> None:
     velocity = "(v-$velocity)^2 + ($step*(f-$force)/m)^2"
     # On a GPU molecules are moved back into the periodic box now and then, by a length of the box: that is no change.
     position = "select(step(0.3 - abs(x-$end)), ((x-$end)/$step)^2, 0)"
-    difference = f"m*({velocity} + {position} - {CHANGE}*(v^2 + ($step*f/m)^2))"
+    # The root is no number where a mass that Context.reinitialize() has brought is negative.
+    difference = f"sqrt(step(m) - 0.5)*m*({velocity} + {position} - {CHANGE}*(v^2 + ($step*f/m)^2))"
     with program.block("$entering > 0"):
         # Before anything is changed: a force may raise an exception here.
         program.sum("$changed", difference)

@@ -88,6 +88,9 @@ class Run:
             return [], None
         self._until_check = self._interval
         message = None
+        system = self.context.getSystem()
+        if system.getNumConstraints() != len(self._constraints):
+            self._constraints = DistanceConstraints(system)
         if len(self._constraints):
             x = positions_of(self.context)
             message, failure = self._check_constraints(x, tolerance)
@@ -108,6 +111,10 @@ class Run:
             rounding += 1e-6 * float(np.max(np.abs(x)) / self._constraints.distances[worst])
         if largest < 10 * max(tolerance, rounding) or largest < 10 * self._largest_error:
             return None, None
+        present = DistanceConstraints(self.context.getSystem())
+        if not np.array_equal(present.distances, self._constraints.distances):  # others since Context.reinitialize()
+            self._constraints = present
+            return self._check_constraints(x, tolerance)
         pair = f"particles {self._constraints.first[worst]} and {self._constraints.second[worst]}"
         if not largest <= LOST:
             advice = redundant_constraints(self.context.getSystem(), x) or (
