@@ -21,12 +21,6 @@ const char MARK[8] = {'V', 'R', 'A', 'T', 'T', 'L', 'E', '\n'};
 const int VERSION = 6;
 const long long CHUNK = 1 << 20; // so that a damaged length does not ask for memory that the data do not fill
 
-unsigned long long fingerprintOf(const string& data) {
-    Fingerprint fingerprint;
-    fingerprint.addBytes(data.data(), data.size());
-    return fingerprint.get();
-}
-
 template <class T> bool readValue(std::istream& stream, T& value) {
     return bool(stream.read(reinterpret_cast<char*>(&value), sizeof(T)));
 }

@@ -4,11 +4,17 @@
 #ifndef OPENMMVRATTLE_FINGERPRINT_H_
 #define OPENMMVRATTLE_FINGERPRINT_H_
 
+#include "openmm/System.h"
 #include "openmm/Vec3.h"
 #include <cstddef>
 #include <cstring>
+#include <map>
+#include <string>
+#include <vector>
 
 namespace OpenMMVRattle {
+
+struct ExpressionConstraint;
 
 /**
  * A 64 bit number made from data (the hash FNV-1a), by which a saved run knows again the System and the state it
@@ -37,6 +43,21 @@ public:
 private:
     unsigned long long value = 14695981039346656037ULL;
 };
+
+/** Of bytes. */
+unsigned long long fingerprintOf(const std::string& data);
+/** Of the masses and the constraints, but for the values of the parameters of expressions. */
+unsigned long long fingerprintOf(const OpenMM::System& system, const std::vector<ExpressionConstraint>& expressions);
+/**
+ * Of the state of a Context, for the particles that move: of velocities in the digits that every platform keeps, so that it knows a
+ * state again that comes from another one. Positions change by rounding where they are wrapped into the box: see sumPositions().
+ */
+unsigned long long fingerprintOf(const std::vector<OpenMM::Vec3>& velocities, const std::vector<double>& masses,
+                                 const OpenMM::Vec3* boxVectors);
+/** Of the parameters of a Context. */
+unsigned long long fingerprintOf(const std::map<std::string, double>& parameters);
+/** Some sums of the positions of all that moves, with signs by chance, the same everywhere: whoever moves particles changes them. */
+std::vector<double> sumPositions(const std::vector<OpenMM::Vec3>& positions, const std::vector<double>& masses);
 
 } // namespace OpenMMVRattle
 

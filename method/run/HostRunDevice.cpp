@@ -3,7 +3,6 @@
 
 #include "run/HostRunDevice.h"
 #include "constraints/StepFailure.h"
-#include "openmm/OpenMMException.h"
 #include "run/Fingerprint.h"
 #include "run/IntegratorSettings.h"
 #include "run/LangevinRun.h"
@@ -14,37 +13,16 @@
 #include <atomic>
 #include <cmath>
 #include <limits>
-#include <random>
 
 using namespace OpenMMVRattle;
-using OpenMM::OpenMMException;
 using OpenMM::System;
 using OpenMM::Vec3;
 using std::vector;
 
 namespace {
 
-const int NUM_POSITION_SUMS = 8;
 // Forces computed twice differ by no more than this fraction, whatever the order of summation in single precision.
 const double FORCE_ROUNDING = 1e-4;
-
-// Whether there is a box in which positions may have been wrapped: one that a Force uses, or that is not OpenMM's default.
-bool hasPeriodicBox(const System& system, const Vec3* boxVectors) {
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            if (boxVectors[i][j] != (i == j ? 2.0 : 0.0))
-                return true;
-    for (int i = 0; i < system.getNumForces(); i++) {
-        try {
-            if (system.getForce(i).usesPeriodicBoundaryConditions())
-                return true;
-        }
-        catch (const OpenMMException&) {
-            // a Force that does not tell
-        }
-    }
-    return false;
-}
 
 // Whether two sets of forces are the same but for rounding; a particle in equilibrium is measured by the others.
 bool agree(const vector<Vec3>& a, const vector<Vec3>& b) {
@@ -104,8 +82,6 @@ HostRunDevice<Method>::HostRunDevice(std::unique_ptr<ContextVectors> vectors, co
         vectors(std::move(vectors)), system(system), masses(massesOf(system)), expressions(settings.expressions),
         method(masses, constraintsOf(system), expressions), forceGroups(0), monitorForceGroup(ContextVectors::NO_GROUP),
         lastStep{0.0, 1.0}, numForceEvaluations(0) {
-    for (int i = 0; i < system.getNumParticles(); i++)
-        isVirtualSite.push_back(system.isVirtualSite(i));
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
     for (int i = 0; i < system.getNumForces(); i++)
         reach.add(system.getForce(i));
@@ -153,53 +129,14 @@ template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
     return Change::None;
 }
 
-template <class Method> unsigned long long HostRunDevice<Method>::getFingerprint() {
-    const Vectors& velocities = vectors->getVelocities();
-    Fingerprint fingerprint;
-    // In the digits that every platform keeps, so that it knows a state again that comes from another one. Positions change by rounding
-    // where they are wrapped into the box; resume() compares them.
-    for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] > 0)
-            for (int d = 0; d < 3; d++)
-                fingerprint.add((double) (float) velocities[i][d]);
-    for (int i = 0; i < 3; i++)
-        fingerprint.add(vectors->getBoxVectors()[i]);
-    return fingerprint.get();
-}
-
-// Some sums of all positions with signs by chance, the same everywhere: whoever moves particles changes them.
-template <class Method> vector<double> HostRunDevice<Method>::sumPositions() {
-    vector<double> sums(NUM_POSITION_SUMS, 0.0);
-    std::minstd_rand random;
-    const Vectors& positions = vectors->getPositions();
-    for (size_t i = 0; i < masses.size(); i++)
-        for (int d = 0; d < 3; d++) {
-            const unsigned signs = (unsigned) random() >> 8;
-            for (int k = 0; k < NUM_POSITION_SUMS && masses[i] > 0; k++)
-                sums[k] += (signs >> k & 1) != 0 ? positions[i][d] : -positions[i][d];
-        }
-    return sums;
-}
-
-template <class Method> unsigned long long HostRunDevice<Method>::getParameterFingerprint() {
-    Fingerprint fingerprint;
-    for (const auto& parameter : vectors->getParameters()) {
-        fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
-        fingerprint.add(parameter.second);
-    }
-    return fingerprint.get();
-}
-
 template <class Method> void HostRunDevice<Method>::start() {
-    const Vec3* box = vectors->getBoxVectors();
-    const bool hasBox = hasPeriodicBox(system, box);
     const Vectors before = vectors->getPositions();
     const std::function<void()> putBackMethod = method.remember();
     try {
         method.adoptParameters();
-        requireSoundStart(method.getConstraintSystem(),
-                          {vectors->getPositions(), vectors->getVelocities(), isVirtualSite, hasBox ? box : nullptr,
-                           method.getParameters()});
+        requireSoundStart(
+            system, method.getConstraintSystem(),
+            {vectors->getPositions(), vectors->getVelocities(), vectors->getBoxVectors(), method.getParameters()});
         vectors->computeVirtualSites(); // setPositions() leaves them where the user puts them
         vectors->requirePositions();
         Vectors positions = vectors->getPositions(), forces;
@@ -442,7 +379,7 @@ template <class Method> double HostRunDevice<Method>::computeHalfStepKineticEner
 
 template <class Method> void HostRunDevice<Method>::save(RunState& run) {
     method.save(run);
-    run.methodValues["positionSums"] = sumPositions();
+    run.methodValues["positionSums"] = sumPositions(vectors->getPositions(), masses);
     run.forces = method.getForces();
     run.groupEnergy = method.getGroupEnergy();
     std::copy(boxVectors, boxVectors + 3, run.boxVectors);
@@ -459,9 +396,10 @@ template <class Method> void HostRunDevice<Method>::save(RunState& run) {
 
 template <class Method>
 bool HostRunDevice<Method>::resume(const RunState& run, const IntegratorSettings& saved, bool areForcesOthers) {
-    const vector<double> sums = sumPositions(), &savedSums = run.getMethodValues("positionSums", NUM_POSITION_SUMS);
+    const vector<double> sums = sumPositions(vectors->getPositions(), masses),
+                         &savedSums = run.getMethodValues("positionSums", sums.size());
     const double largest = 4 * getPositionRounding() * std::sqrt(3.0 * masses.size());
-    for (int k = 0; k < NUM_POSITION_SUMS; k++)
+    for (size_t k = 0; k < sums.size(); k++)
         if (!(std::fabs(sums[k] - savedSums[k]) <= largest))
             return false;
     const Vectors& positions = run.positions.empty() ? vectors->getPositions() : run.positions;

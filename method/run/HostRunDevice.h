@@ -8,6 +8,7 @@
 #include "expressions/ExpressionGroup.h"
 #include "openmm/System.h"
 #include "run/ContextVectors.h"
+#include "run/Fingerprint.h"
 #include "run/ForceReach.h"
 #include "run/RunDevice.h"
 #include <memory>
@@ -51,8 +52,12 @@ public:
         return vectors->updateState();
     }
     Change findChange() override;
-    unsigned long long getFingerprint() override;
-    unsigned long long getParameterFingerprint() override;
+    unsigned long long getFingerprint() override {
+        return fingerprintOf(vectors->getVelocities(), masses, vectors->getBoxVectors());
+    }
+    unsigned long long getParameterFingerprint() override {
+        return fingerprintOf(vectors->getParameters());
+    }
     void start() override;
     void changeState() override;
     void changeVelocities() override;
@@ -85,6 +90,9 @@ public:
     long long getNumForceEvaluations() override {
         return numForceEvaluations;
     }
+    long long getNumSolverIterations() override {
+        return method.getNumIterations();
+    }
     StepCounts getCounts() override {
         return method.getCounts();
     }
@@ -111,7 +119,6 @@ protected:
     virtual double getPositionRounding() const {
         return 0;
     }
-    std::vector<double> sumPositions();
     bool differ(const Vectors& a, const Vectors& b);
     void writeMovingPositions(const Vectors& positions);
     void writeMovingVelocities(const Vectors& velocities);
@@ -119,7 +126,6 @@ protected:
     std::unique_ptr<ContextVectors> vectors;
     const OpenMM::System& system;
     std::vector<double> masses;
-    std::vector<char> isVirtualSite;
     std::vector<ExpressionConstraint> expressions;
     Method method;
     int forceGroups, monitorForceGroup;

@@ -25,7 +25,7 @@ public:
      * @param device          does the work; must live as long as the run
      * @param settings        of the integrator, whose changes settingsChanged() announces; must live as long as the run
      * @param numParticles    of the System
-     * @param system          RunState::fingerprintOf() the System
+     * @param system          fingerprintOf() the System (Fingerprint.h)
      */
     IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles, unsigned long long system);
 

@@ -28,7 +28,6 @@ void LangevinRun::setFindings(const Findings& findings) {
 
 StepCounts LangevinRun::getCounts() const {
     StepCounts counts;
-    counts.solverIterations = getNumIterations();
     counts.substepped = getNumSubstepped();
     counts.largestSubsteps = getLargestSubsteps();
     return counts;

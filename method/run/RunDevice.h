@@ -165,9 +165,10 @@ public:
     virtual double getNegligibleValue() = 0;
     /** At constant temperature: the kinetic energy that is reported, which is not that of the velocities; the two states agree. */
     virtual double computeHalfStepKineticEnergy() = 0;
-    /** How often forces have been computed since the device exists. */
+    /** How often forces have been computed, and iterations of the solver taken, since the device exists. */
     virtual long long getNumForceEvaluations() = 0;
-    /** What else there has been of work since then. */
+    virtual long long getNumSolverIterations() = 0;
+    /** What has been counted of steps since then. */
     virtual StepCounts getCounts() = 0;
     /** Whether the last step() was for a GPU to take, and not for the host with forces from it. */
     virtual bool hasSteppedOnDevice() {

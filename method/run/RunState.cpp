@@ -3,8 +3,6 @@
 
 #include "run/RunState.h"
 #include "openmm/OpenMMException.h"
-#include "run/Fingerprint.h"
-#include "run/IntegratorSettings.h"
 #include <algorithm>
 #include <istream>
 #include <ostream>
@@ -174,26 +172,6 @@ template <class Form> void exchange(RunState& run, Form form) {
 }
 
 } // namespace
-
-unsigned long long RunState::fingerprintOf(const OpenMM::System& system, const IntegratorSettings& settings) {
-    Fingerprint fingerprint;
-    for (int i = 0; i < system.getNumParticles(); i++)
-        fingerprint.add(system.getParticleMass(i));
-    for (int i = 0; i < system.getNumConstraints(); i++) {
-        int particle1, particle2;
-        double distance;
-        system.getConstraintParameters(i, particle1, particle2, distance);
-        fingerprint.add(Vec3(particle1, particle2, distance));
-    }
-    for (const ExpressionConstraint& constraint : settings.expressions) {
-        fingerprint.addBytes(constraint.expression.c_str(), constraint.expression.size() + 1);
-        for (int particle : constraint.particles)
-            fingerprint.add(particle);
-        for (const auto& parameter : constraint.parameters)
-            fingerprint.addBytes(parameter.first.c_str(), parameter.first.size() + 1);
-    }
-    return fingerprint.get();
-}
 
 // Writing changes nothing.
 void RunState::write(std::ostream& stream) const {

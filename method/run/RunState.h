@@ -4,7 +4,6 @@
 #ifndef OPENMMVRATTLE_RUNSTATE_H_
 #define OPENMMVRATTLE_RUNSTATE_H_
 
-#include "openmm/System.h"
 #include "openmm/Vec3.h"
 #include "openmm/serialization/SerializationNode.h"
 #include <iosfwd>
@@ -14,19 +13,15 @@
 
 namespace OpenMMVRattle {
 
-struct IntegratorSettings;
-
 /** What a method finds in the course of a run, and a new start does not take from it. */
 struct Findings {
     std::vector<double> references;  // U_k,ref in force of each value of getMonitorValues(), 0 if not known
-    double referenceTemperature =
-        0; // 2K/f (kJ/mol) where those of automatic step control were found; 0 if they were not
+    double referenceTemperature = 0; // 2K/f (kJ/mol) where automatic step control found its own; 0 if it did not
     std::vector<double> random;      // the seed in force, and how many steps have drawn numbers with it; or empty
 };
 
 /** What has been counted of the steps of a method since it exists; each counts what it knows of. */
 struct StepCounts {
-    long long solverIterations = 0;
     long long rescues = 0;    // steps that took the density of another update
     long long shortSteps = 0; // the most in a row that were shorter than a tenth of the nominal one
     long long substepped = 0; // steps that were made of substeps
@@ -41,9 +36,6 @@ struct StepCounts {
  * forces are others, and then the run must start afresh.
  */
 struct RunState {
-    /** Fingerprint of the masses and the constraints, but for the values of the parameters of expressions. */
-    static unsigned long long fingerprintOf(const OpenMM::System& system, const IntegratorSettings& settings);
-
     /** Write or read everything, in binary form with a stream and as text with a SerializationNode. */
     void write(std::ostream& stream) const;
     void read(std::istream& stream);

@@ -3,6 +3,8 @@
 
 #include "run/StartCheck.h"
 #include "constraints/StepFailure.h"
+#include "openmm/Force.h"
+#include "openmm/OpenMMException.h"
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -37,9 +39,28 @@ double lengthOf(const Vec3& x) {
     return std::sqrt(x.dot(x));
 }
 
-void requirePositions(const StartState& state) {
-    for (size_t i = 0; i < state.positions.size(); i++)
-        if (!state.isVirtualSite[i] && !isFinite(state.positions[i]))
+// Whether there is a box in which positions may have been wrapped: one that a Force uses, or that is not OpenMM's default.
+bool hasPeriodicBox(const OpenMM::System& system, const Vec3* boxVectors) {
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            if (boxVectors[i][j] != (i == j ? 2.0 : 0.0))
+                return true;
+    for (int i = 0; i < system.getNumForces(); i++) {
+        try {
+            if (system.getForce(i).usesPeriodicBoundaryConditions())
+                return true;
+        }
+        catch (const OpenMM::OpenMMException&) {
+            // a Force that does not tell
+        }
+    }
+    return false;
+}
+
+// But for those of virtual sites, which are computed.
+void requirePositions(const OpenMM::System& system, const StartState& state) {
+    for (int i = 0; i < system.getNumParticles(); i++)
+        if (!system.isVirtualSite(i) && !isFinite(state.positions[i]))
             throw StepFailure("the position of particle " + std::to_string(i) +
                               " is not a finite number; set it before stepping");
 }
@@ -161,11 +182,12 @@ void requireWholeExpressions(const ConstraintSystem& system, const StartState& s
 
 } // namespace
 
-void OpenMMVRattle::requireSoundStart(const ConstraintSystem& system, const StartState& state) {
-    requirePositions(state);
-    requireVelocities(system, state);
-    if (state.boxVectors == nullptr)
+void OpenMMVRattle::requireSoundStart(const OpenMM::System& system, const ConstraintSystem& constraints,
+                                      const StartState& state) {
+    requirePositions(system, state);
+    requireVelocities(constraints, state);
+    if (!hasPeriodicBox(system, state.boxVectors))
         return;
-    requireWholeDistances(system, state);
-    requireWholeExpressions(system, state);
+    requireWholeDistances(constraints, state);
+    requireWholeExpressions(constraints, state);
 }

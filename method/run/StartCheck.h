@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_STARTCHECK_H_
 
 #include "constraints/ConstraintSystem.h"
+#include "openmm/System.h"
 #include "openmm/Vec3.h"
 #include <vector>
 
@@ -13,9 +14,7 @@ namespace OpenMMVRattle {
 /** What a run is to start from. */
 struct StartState {
     const std::vector<OpenMM::Vec3>&positions, &velocities;
-    /** For each particle whether it is a virtual site, whose position is computed. */
-    const std::vector<char>& isVirtualSite;
-    /** The three vectors of the periodic box in OpenMM's reduced form, or none if there is no such box. */
+    /** The three vectors of the periodic box in OpenMM's reduced form, which every System has, whether it means anything or not. */
     const OpenMM::Vec3* boxVectors;
     /** Of the expressions. */
     const ExpressionParameters& parameters;
@@ -28,7 +27,7 @@ struct StartState {
  *
  * @throws StepFailure    which names the particles and the way out
  */
-void requireSoundStart(const ConstraintSystem& system, const StartState& state);
+void requireSoundStart(const OpenMM::System& system, const ConstraintSystem& constraints, const StartState& state);
 
 } // namespace OpenMMVRattle
 

@@ -19,7 +19,6 @@ const double TINY = 1e-100;
 
 StepCounts VRattleRun::getCounts() {
     StepCounts counts;
-    counts.solverIterations = getNumIterations();
     counts.rescues = getNumRescues();
     counts.shortSteps = (long long) getAutomaticControl().getMemory().mostShortSteps;
     return counts;

@@ -127,6 +127,9 @@ public:
     long long getNumForceEvaluations() override {
         return 0;
     }
+    long long getNumSolverIterations() override {
+        return 0;
+    }
     StepCounts getCounts() override {
         return {};
     }

@@ -13,6 +13,7 @@
 #include "openmm/serialization/XmlSerializer.h"
 #include "openmmvrattle/VRattleKernels.h"
 #include "run/CheckpointBlock.h"
+#include "run/Fingerprint.h"
 #include "run/IntegratorRun.h"
 #include <algorithm>
 #include <cmath>
@@ -170,7 +171,7 @@ bool ConstrainedIntegrator::isOnDevice() const {
 }
 
 long long ConstrainedIntegrator::getNumSolverIterations() const {
-    return run == nullptr ? 0 : run->getDevice().getCounts().solverIterations;
+    return run == nullptr ? 0 : run->getDevice().getNumSolverIterations();
 }
 
 // ------------------------------------------------------------------------------------------ constraints by expressions
@@ -329,7 +330,7 @@ void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {
     OpenMM::Kernel created = contextRef.getPlatform().createKernel(IntegrateVRattleStepKernel::Name(), contextRef);
     RunDevice& device = created.getAs<IntegrateVRattleStepKernel>().initialize(contextRef, *this, *settings);
     run = std::make_unique<IntegratorRun>(device, *settings, system.getNumParticles(),
-                                          RunState::fingerprintOf(system, *settings));
+                                          fingerprintOf(system, settings->expressions));
     kernel = created;
     context = &contextRef;
     owner = &contextRef.getOwner();

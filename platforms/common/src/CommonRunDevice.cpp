@@ -546,10 +546,15 @@ template <class Method> double CommonRunDevice<Method>::computeHalfStepKineticEn
     return Host::computeHalfStepKineticEnergy();
 }
 
+template <class Method> long long CommonRunDevice<Method>::getNumSolverIterations() {
+    settle();
+    return Host::getNumSolverIterations() + (steps == nullptr ? 0 : steps->getNumIterations());
+}
+
+// Which Python asks for after each call of step(), to warn.
 template <class Method> StepCounts CommonRunDevice<Method>::getCounts() {
     settle();
     StepCounts counts = Host::getCounts();
-    counts.solverIterations += steps == nullptr ? 0 : steps->getNumIterations();
     counts.rescues += numDeviceRescues;
     return counts;
 }

@@ -52,6 +52,7 @@ public:
         return true;
     }
     double computeHalfStepKineticEnergy() override;
+    long long getNumSolverIterations() override;
     StepCounts getCounts() override;
     bool hasSteppedOnDevice() override {
         return hasStepped;
