@@ -13,6 +13,8 @@ namespace {
 
 // At a temperature higher by this factor references are found anew.
 const double MUCH_HOTTER = 4;
+// Up to so many particles a cluster counts as one, beyond that as its part of them: what thermal motion does to them adds up.
+const int SMALL_CLUSTER = 12;
 
 void requireFinite(double value, const char* name) {
     if (!std::isfinite(value))
@@ -25,6 +27,11 @@ void requireFinite(double value, const char* name) {
 AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
         solver(solver), system(solver.getSystem()), clusterForces(solver), numClusters(clusterForces.getNumClusters()),
         choice(), references(), memory(), temperature(0), measured() {
+    vector<double> sizes(numClusters);
+    clusterForces.sumOverClusters([](int) { return 1.0 / SMALL_CLUSTER; }, sizes);
+    for (double& size : sizes)
+        size = std::max(1.0, size);
+    thermalSize = std::max(1.0, clusterForces.eighthRootOfFourthPowers(sizes));
     numDegreesOfFreedom = std::max(1.0, 3.0 * (double) solver.getMovingParticles().size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
@@ -35,7 +42,7 @@ void AutomaticControl::setSettings(const Settings& settings) {
     choice.minimumStep = settings.minimumStep;
     choice.learningSteps = settings.learningSteps;
     std::copy(settings.given, settings.given + NUM_MONITORS, choice.given);
-    choice.thermalUnit = std::pow((double) std::max(1, numClusters), 0.125) / settings.stepSize;
+    choice.thermalUnit = thermalSize / settings.stepSize;
 }
 
 // -------------------------------------------------------------------------------------------------------- the monitors

@@ -26,7 +26,9 @@ inline wide unstretch(wide y, wide a) {
     return StepDensity::inverseOfF(y, a);
 }
 #define DEVICE
+#define SELDOM inline
 #include "step/AutomaticRecursions.h"
+#undef SELDOM
 #undef DEVICE
 } // namespace AutomaticRecursions
 
@@ -168,7 +170,7 @@ private:
     const ConstraintSystem& system;
     ClusterForces clusterForces;
     int numClusters;
-    double numDegreesOfFreedom;
+    double thermalSize, numDegreesOfFreedom;
     AutomaticRecursions::AutomaticChoice choice;
     double references[NUM_MONITORS];
     Memory memory;

@@ -7,6 +7,8 @@
 //
 //     wide                          the type of all numbers
 //     stretch(rho, a) and unstretch(y, a)    f(rho) = (rho - a) - (1 - a)^2/(rho - a) and its inverse
+//     SELDOM                        before functions that calm steps do not call; a device shall not write them out where they are
+//                                   called, for what does not fit into its instruction cache costs more than all the arithmetic
 //
 // Constants are quotients of whole numbers, since not all devices have literals in double precision. Monitor 0 is U_A, on steps;
 // monitor 1 is U_B, on half steps.
@@ -27,7 +29,7 @@ typedef struct {
     wide stepSize, minimumStep; // ps; no minimum if that is 0
     wide learningSteps; // how many steps the references are the mean of
     wide given[2]; // references that are not to be found; 0 for the others
-    wide thermalUnit; // n_c^(1/8)/stepSize
+    wide thermalUnit; // (sum_c max(1, N_c/12)^4)^(1/8)/stepSize with the number N_c of particles in a cluster
 } AutomaticChoice;
 
 /** The value of a monitor where the momenta of every cluster change by those of this 2K/f in a nominal step. */
@@ -43,6 +45,14 @@ inline DEVICE wide automaticRoomTemperature(void) {
 /** What is nothing, but for rounding. */
 inline DEVICE wide automaticNegligibleValue(const AutomaticChoice* choice) {
     return automaticThermalValue(choice, automaticRoomTemperature()) / 1000000;
+}
+
+SELDOM DEVICE wide automaticLogarithm(wide x) {
+    return log(x);
+}
+
+SELDOM DEVICE wide automaticExponential(wide x) {
+    return exp(x);
 }
 
 inline DEVICE wide automaticSixteenthPower(wide x) {
@@ -64,10 +74,10 @@ inline DEVICE wide automaticDeadZone(wide u) {
 }
 
 /** No step is below the minimum, and a density of 1 stays what it is. */
-inline DEVICE wide automaticLimit(const AutomaticChoice* choice, wide density) {
-    if (!(density > 1) || choice->minimumStep == 0)
+inline DEVICE wide automaticLimit(wide stepSize, wide minimumStep, wide density) {
+    if (!(density > 1) || minimumStep == 0)
         return density;
-    const wide excess = density - 1, largest = choice->stepSize / choice->minimumStep - 1, ratio = excess / largest;
+    const wide excess = density - 1, largest = stepSize / minimumStep - 1, ratio = excess / largest;
     return ratio > 10 ? 1 + largest : 1 + excess / automaticSixteenthRoot(1 + automaticSixteenthPower(ratio));
 }
 
@@ -76,19 +86,31 @@ inline DEVICE wide automaticSmallest(void) {
     return (wide) 3 / 4;
 }
 
+/** f(phi(u)) of a monitor k, this many times its reference. */
+SELDOM DEVICE wide automaticHardTarget(wide stepSize, wide minimumStep, int k, wide ratio) {
+    const wide u = pow(ratio, k == 0 ? (wide) 2 / 3 : (wide) 4 / 5);
+    return stretch(automaticLimit(stepSize, minimumStep, automaticDeadZone(u)), automaticSmallest());
+}
+
 /** f(phi(u)) of a monitor k; f(1) = 0 while there is no reference, and in the dead zone. */
 inline DEVICE wide automaticTarget(const wide* references, const AutomaticChoice* choice, int k, wide value) {
     const wide calm = (wide) 23 / 10; // whose powers are less than 2
     if (!(references[k] > 0) || value < calm * references[k])
         return 0;
-    const wide u = pow(value / references[k], k == 0 ? (wide) 2 / 3 : (wide) 4 / 5);
-    return stretch(automaticLimit(choice, automaticDeadZone(u)), automaticSmallest());
+    return automaticHardTarget(choice->stepSize, choice->minimumStep, k, value / references[k]);
 }
 
 /** rho of f(A) and f(B). */
+SELDOM DEVICE wide automaticHardDensity(wide stepSize, wide minimumStep, wide transformedA, wide transformedB) {
+    const wide a = unstretch(transformedA, automaticSmallest()), b = unstretch(transformedB, automaticSmallest());
+    return automaticLimit(stepSize, minimumStep, sqrt((a * a + b * b) / 2));
+}
+
+/** The same, which is exactly 1 where both are 0. */
 inline DEVICE wide automaticDensity(const AutomaticChoice* choice, const wide* transformed) {
-    const wide a = unstretch(transformed[0], automaticSmallest()), b = unstretch(transformed[1], automaticSmallest());
-    return automaticLimit(choice, sqrt((a * a + b * b) / 2));
+    if (transformed[0] == 0 && transformed[1] == 0)
+        return 1;
+    return automaticHardDensity(choice->stepSize, choice->minimumStep, transformed[0], transformed[1]);
 }
 
 /** Draw both sequences towards their monitors by a part of their distance. */
@@ -128,9 +150,10 @@ inline DEVICE void automaticLearn(AutomaticNumbers* m, wide* references, const A
     m->numLearnt += 1;
     m->temperature += (kT - m->temperature) / m->numLearnt;
     for (int k = 0; k < 2; k++)
-        m->logarithms[k] += (log(m->values[k]) - m->logarithms[k]) / m->numLearnt;
+        m->logarithms[k] += (automaticLogarithm(m->values[k]) - m->logarithms[k]) / m->numLearnt;
     if (m->numLearnt >= choice->learningSteps)
-        automaticSetFound(m, references, choice, exp(m->logarithms[0]), exp(m->logarithms[1]));
+        automaticSetFound(m, references, choice, automaticExponential(m->logarithms[0]),
+                          automaticExponential(m->logarithms[1]));
 }
 
 /** While they follow, references are not less than a fifth of the thermal value. */
@@ -152,8 +175,8 @@ inline DEVICE void automaticFollow(AutomaticNumbers* m, wide* references, const 
     m->temperature += min((wide) 1, weight) * (kT - m->temperature);
     for (int k = 0; k < 2; k++)
         if (choice->given[k] == 0) {
-            const wide surprise = log(m->values[k] / references[k]);
-            references[k] *= exp(weight * min(max(surprise, -largest), largest));
+            const wide surprise = automaticLogarithm(m->values[k] / references[k]);
+            references[k] *= automaticExponential(weight * min(max(surprise, -largest), largest));
         }
     automaticRaiseReferences(references, choice, kT);
 }

@@ -30,7 +30,7 @@ from dense_reference import (
     waters,
     whip,
 )
-from openmmvrattle import VariableStepRattleIntegrator, XmlSerializer
+from openmmvrattle import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator, XmlSerializer
 from openmmvrattle.testsystems import (
     TestSystem,
     alanine_dipeptide,
@@ -333,6 +333,33 @@ def test_steps_stay_fixed_where_nothing_happens(step: float) -> None:
         assert np.max(np.abs(densities - 1)) < 0.01
         assert densities.mean() == pytest.approx(1, abs=1e-3)
         del context
+
+
+def test_a_large_cluster_is_not_hard_for_its_size() -> None:
+    """A chain of 3,000 rigid bonds is one cluster, in which thermal motion adds up."""
+    count, rise, half_width = 3000, 0.126, 0.04
+    system, angles = openmm.System(), openmm.HarmonicAngleForce()
+    for i in range(count):
+        system.addParticle(14)
+        if i > 0:
+            system.addConstraint(i - 1, i, float(np.hypot(rise, 2 * half_width)))
+        if i > 1:
+            angles.addAngle(i - 2, i - 1, i, np.pi - 2 * np.arctan(2 * half_width / rise), 500)
+    system.addForce(angles)
+    start = np.array([[rise * i, half_width * (-1) ** i, 0] for i in range(count)])
+    bath = VariableStepRattleLangevinIntegrator(300, 20, 0.002, randomNumberSeed=1)
+    warm = openmm.Context(system, bath, openmm.Platform.getPlatform("CPU"))
+    warm.setPositions(start)
+    bath.setVelocitiesToTemperature(300, 1)
+    bath.step(1000)
+    integrator = automatic(0.002)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform("CPU"))
+    context.setState(warm.getState(positions=True, velocities=True))
+    # Far more than 8 of the units of small molecules: sqrt(2K/f)/stepSize.
+    densities = densities_of(integrator, 100)
+    assert integrator.getMonitorValue() > 10 * np.sqrt(2.494) / 0.002
+    assert np.all(densities == 1)
+    assert integrator.getReferenceMonitorValue(0) == pytest.approx(integrator.getMonitorValue(), rel=0.2)
 
 
 def test_the_density_does_not_begin_to_oscillate() -> None:
