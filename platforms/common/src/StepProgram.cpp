@@ -22,7 +22,7 @@ namespace {
 
 const int MANY_ENTRIES = 16; // of the matrix of Newton's iteration
 const int MOST_IN_REGISTERS = 6; // constraints; of more the distance vectors are in local memory
-const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
+const int MAX_ITERATIONS = 20, LARGEST_POWER = 64, NUM_AUTOMATIC_TERMS = 6;
 // Of a part with expressions: where so many chord iterations do not converge Newton's follow.
 const int MAX_CHORD_ITERATIONS = 12, MAX_PART_ITERATIONS = 100;
 // Of a group that waits for others, about 0.2 s; they come within microseconds.
@@ -64,7 +64,7 @@ enum Quantity {
     SpeedSquares,   // sum |v|^2
     LargestForce,   // max |F|^2
     LargestArc,     // max |F|^2 + |v|^2
-    ClusterPowers,  // A_c of Langevin dynamics
+    ClusterPowers,  // sum A_c^4 of Langevin dynamics
     Failures,       // of trials
     // Of automatic step control, which adds them up itself (kernels/automatic.cc)
     HardnessOnStep, // sum A_c^4
@@ -73,9 +73,8 @@ enum Quantity {
     AutomaticChange,
     AutomaticScale
 };
-// A p-norm takes two places; one of sums over the particles of a cluster a third, for the pieces of large clusters.
-enum Merge { Add, Largest, Power, ClusterPower };
-const double ORDER_OF_CLUSTERS = 4;
+// A p-norm takes two places, and so do fourth powers of sums over the particles of a cluster, for the pieces of large clusters.
+enum Merge { Add, Largest, Power, FourthPowers };
 struct QuantityText {
     Merge merge;
     bool ofConstraint;
@@ -92,10 +91,10 @@ const map<Quantity, QuantityText> QUANTITIES = {
     {SpeedSquares, {Add, false, "dot3(v, v)"}},
     {LargestForce, {Largest, false, "forceSquared"}},
     {LargestArc, {Largest, false, "forceSquared + dot3(v, v)"}},
-    {ClusterPowers, {ClusterPower, false, "(netSquared + sqrt(netSquared)*dot3(v, v)/FLIGHT_LENGTH)/w"}},
+    {ClusterPowers, {FourthPowers, false, "(netSquared + sqrt(netSquared)*dot3(v, v)/FLIGHT_LENGTH)/w"}},
     {Failures, {Add, false, nullptr}},
-    {HardnessOnStep, {Power, false, nullptr}},
-    {HardnessOnHalfStep, {Power, false, nullptr}},
+    {HardnessOnStep, {Add, false, nullptr}},
+    {HardnessOnHalfStep, {Add, false, nullptr}},
     {AutomaticKinetic, {Add, false, nullptr}},
     {AutomaticChange, {Add, false, nullptr}},
     {AutomaticScale, {Add, false, nullptr}}};
@@ -105,7 +104,7 @@ struct MonitorText {
     string value; // in which $0 and $1 stand for the sums
 };
 // U = (sum_c A_c^4)^(1/8)
-const MonitorText NET_FORCES = {{ClusterPowers}, "($0c == 0 ? sqrt($0)*sqrt(sqrt(sqrt($0b))) : (wide) -1)"};
+const MonitorText NET_FORCES = {{ClusterPowers}, "($0b == 0 ? eighthRoot($0) : (wide) -1)"};
 const map<StepMonitor::Kind, MonitorText> MONITORS = {
     {StepMonitor::ConstraintMultipliers, {{MultiplierSquares}, "sqrt($0)"}}, // (4.4)
     {StepMonitor::ConstraintForce, {{ConstraintWork}, "sqrt(max($0, (wide) 0))"}},
@@ -148,6 +147,9 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
     if (areShared)
         defines["NUM_THREADS"] = to_string(numThreads);
     writeMonitors(terms);
+    if (areShared && update == Automatic)
+        // A piece leaves those of its cluster, and of how many pieces that is.
+        numSums = std::max(numSums, NUM_AUTOMATIC_TERMS + 1);
     const int bytesOfGroup = getGroupSize(areShared) * (isMixed ? 8 : 4); // for one number of each thread
     const int numKept = writeClusters(findSmallKinds(layout), large.getLocalMemory() / bytesOfGroup);
     writeLargeClusters(large, numKept * bytesOfGroup);
@@ -239,6 +241,8 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
     defines["SLOW_CONVERGENCE"] = "0.25f";
     defines["BOUND_MARGIN"] = literal(StepDensity::DOMAIN_MARGIN);
     defines["SLIVER"] = "1e-6f";
+    defines["LARGEST_FOURTH_POWER"] = isMixed ? "1e280" : "1e36f";
+    defines["LARGEST_OF_FOURTH_POWERS"] = isMixed ? "1e70" : "1e9f";
     defines["FLIGHT_LENGTH"] = "(mixed) " + literal(LangevinDynamics::FLIGHT_LENGTH) + (isMixed ? "" : "f");
 }
 
@@ -249,13 +253,13 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
     numSums = 0;
     auto keyOf = [](Quantity quantity, double order) {
         const Merge merge = QUANTITIES.at(quantity).merge;
-        return Key(quantity, merge == Power ? order : merge == ClusterPower ? ORDER_OF_CLUSTERS : 0.0);
+        return Key(quantity, merge == Power ? order : 0.0);
     };
     auto add = [&](const Key& key) {
         if (places.count(key) == 0) {
             places[key] = numSums;
             const Merge merge = QUANTITIES.at(key.first).merge;
-            numSums += merge == ClusterPower ? 3 : merge == Power ? 2 : 1;
+            numSums += merge == Power || merge == FourthPowers ? 2 : 1;
         }
         return places[key];
     };
@@ -266,15 +270,14 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
         for (size_t i = 0; i < monitor.quantities.size(); i++) {
             const int place = add(keyOf(monitor.quantities[i], terms[k].order));
             replaceAll(value, "$" + to_string(i) + "b", "(wide) sums[" + to_string(place + 1) + "]");
-            replaceAll(value, "$" + to_string(i) + "c", "(wide) sums[" + to_string(place + 2) + "]");
             replaceAll(value, "$" + to_string(i), "(wide) sums[" + to_string(place) + "]");
         }
         replaceAll(value, "$p", literal(1 / terms[k].order));
         values += "values[" + to_string(k) + "] = " + value + ";\n    ";
     }
     if (update == Automatic) {
-        defines["SUM_ON_STEP"] = to_string(add(Key(HardnessOnStep, 4)));
-        defines["SUM_HALF_STEP"] = to_string(add(Key(HardnessOnHalfStep, 4)));
+        defines["SUM_ON_STEP"] = to_string(add(Key(HardnessOnStep, 0)));
+        defines["SUM_HALF_STEP"] = to_string(add(Key(HardnessOnHalfStep, 0)));
         defines["SUM_KINETIC"] = to_string(add(Key(AutomaticKinetic, 0)));
         defines["SUM_CHANGE"] = to_string(add(Key(AutomaticChange, 0)));
         defines["SUM_SCALE"] = to_string(add(Key(AutomaticScale, 0)));
@@ -298,19 +301,17 @@ void StepProgram::writeMonitors(const vector<StepMonitor::Term>& terms) {
             text += sum + " = max(" + sum + ", " + quantity.term + ");\n    ";
             mergeTerms += sum + " = max(" + sum + ", " + other + ");\n    ";
             break;
-        case Power:
-        case ClusterPower: {
-            const bool ofCluster = quantity.merge == ClusterPower;
+        case Power: {
             const string name =
                 "Power_" + to_string(orders.insert({entry.first.second, (int) orders.size()}).first->second);
-            if (quantity.term != nullptr)
-                (ofCluster ? clusterTerms : text) +=
-                    "add" + name + "(sums + " + address + ", " + (ofCluster ? "share" : quantity.term) + ");\n    ";
+            text += "add" + name + "(sums + " + address + ", " + quantity.term + ");\n    ";
             mergeTerms += "merge" + name + "(sums + " + address + ", other + " + address + ");\n    ";
-            if (!ofCluster)
-                break;
-            const string piece = to_string(entry.second + 2);
-            mergeTerms += "sums[" + piece + "] += other[" + piece + "];\n    ";
+            break;
+        }
+        case FourthPowers: {
+            const string piece = to_string(entry.second + 1);
+            clusterTerms += "addFourthPower(sums + " + address + ", share);\n    ";
+            mergeTerms += sum + " += " + other + ";\n    sums[" + piece + "] += other[" + piece + "];\n    ";
             shareTerm = quantity.term;
             defines["PIECE_COUNT"] = address;
             defines["PIECE_SHARE"] = piece;
@@ -441,6 +442,7 @@ void StepProgram::writeAutomaticControl(int numPieces) {
     text = DeviceSources::automatic;
     replaceAll(text, "AUTOMATIC_RECURSIONS", DeviceSources::AutomaticRecursions);
     const map<string, int> numbers = {{"NUM_PIECES", numPieces},
+                                      {"NUM_TERMS", NUM_AUTOMATIC_TERMS},
                                       {"NUM_CHOICES", Control::NumAutomaticChoices},
                                       {"NUM_NUMBERS", Control::NumAutomaticNumbers},
                                       {"FIRST_REFERENCE", Control::FirstReference},

@@ -6,7 +6,7 @@
 
 AUTOMATIC_RECURSIONS
 
-// The sums are U_A^8 and U_B^8 as those of p-norms (power.cc), and the last three terms below.
+// The sums are those of fourth powers, and the last three terms below.
 
 // What is added up over the particles of a cluster, or of a piece of one, before that.
 #define TERM_SQUARES 0 // S_c
@@ -15,7 +15,6 @@ AUTOMATIC_RECURSIONS
 #define TERM_KINETIC 3
 #define TERM_CHANGE 4  // the square of what others have changed velocities or forces by, in the mass metric
 #define TERM_SCALE 5   // that of the velocities or forces
-#define NUM_TERMS 6
 // Behind the sums of a piece: of how many pieces its cluster is, if it is the first of them, else 0.
 #define PIECE_COUNT NUM_TERMS
 
@@ -46,22 +45,32 @@ inline DEVICE LastState makeLastState(mixed kick, mixed dt, int change LAST_STAT
     return last;
 }
 
-/**
- * The terms of a particle with inverse mass w that compare forces; then F[n] takes the place of F[n-1]. (x, y, z) is its half-step
- * velocity.
- */
-inline DEVICE void followForce(mixed* terms, LastState last, GLOBAL const mm_long* RESTRICT force, int paddedNumAtoms, int atom, mixed w, mixed x, mixed y, mixed z) {
-    const mixed scale = 1/(mixed) 0x100000000, velocity[3] = {x, y, z};
-    const int place = last.order[atom];
+/** F[n-1] of a particle, and where it is kept. */
+typedef struct {
+    int place;
+    mm_long sums[3];
+} LastForce;
+
+inline DEVICE LastForce loadLastForce(LastState last, int paddedNumAtoms, int atom) {
+    LastForce result;
+    result.place = last.order[atom];
+    UNROLL for (int d = 0; d < 3; d++)
+        result.sums[d] = last.forces[result.place + d*paddedNumAtoms];
+    return result;
+}
+
+/** The terms of a particle with inverse mass w and half-step velocity v that compare forces; then F[n] takes the place of F[n-1]. */
+inline DEVICE void followForce(mixed* terms, LastState last, LastForce lastForce, GLOBAL const mm_long* RESTRICT force, int paddedNumAtoms, int atom, mixed w, const mixed* v) {
+    const mixed scale = 1/(mixed) 0x100000000;
     mixed change[3], now[3], before[3];
     UNROLL for (int d = 0; d < 3; d++) {
-        const mm_long sum = force[atom + d*paddedNumAtoms], lastSum = last.forces[place + d*paddedNumAtoms];
+        const mm_long sum = force[atom + d*paddedNumAtoms], lastSum = lastForce.sums[d];
         change[d] = scale*(sum - lastSum);
         now[d] = scale*sum;
         before[d] = scale*lastSum;
-        last.forces[place + d*paddedNumAtoms] = sum;
+        last.forces[lastForce.place + d*paddedNumAtoms] = sum;
     }
-    terms[TERM_WORK] += dot3(velocity, change);
+    terms[TERM_WORK] += dot3(v, change);
     if (last.change == FORCES_CHANGED) {
         terms[TERM_CHANGE] += w*dot3(change, change);
         terms[TERM_SCALE] += w*max(dot3(now, now), dot3(before, before));
@@ -74,21 +83,21 @@ inline DEVICE void addFlight(mixed* terms, mixed forceSquared, const mixed* v) {
 
 /** The other terms, with the acceleration a by the net force F - G^T Lambda. */
 inline DEVICE void addAutomaticTerms(mixed* terms, LastState last, int atom, mixed w, const mixed* v, const mixed* a) {
-    const mixed speedSquared = dot3(v, v), momentum = speedSquared/w;
-    terms[TERM_SQUARES] += dot3(a, a)/w + momentum*speedSquared*(mixed) FLIGHT_WEIGHT;
+    const mixed mass = 1/w, speedSquared = dot3(v, v), momentum = mass*speedSquared;
+    terms[TERM_SQUARES] += mass*dot3(a, a) + momentum*speedSquared*(mixed) FLIGHT_WEIGHT;
     terms[TERM_KINETIC] += momentum;
     if (last.change == VELOCITIES_CHANGED) {
         const mixed4 before = last.velocities[atom];
         const mixed change[3] = {v[0] - before.x, v[1] - before.y, v[2] - before.z};
-        terms[TERM_CHANGE] += dot3(change, change)/w;
+        terms[TERM_CHANGE] += mass*dot3(change, change);
         terms[TERM_SCALE] += momentum;
     }
 }
 
 /** What all particles of a cluster together add to the sums; work is rate |sum of TERM_WORK|. */
 inline DEVICE void addHardness(mixed* sums, mixed onStep, mixed work, mixed meanSquares, const mixed* terms) {
-    addPower_0(sums + SUM_ON_STEP, onStep);
-    addPower_0(sums + SUM_HALF_STEP, work + meanSquares);
+    addFourthPower(sums + SUM_ON_STEP, onStep);
+    addFourthPower(sums + SUM_HALF_STEP, work + meanSquares);
     sums[SUM_KINETIC] += terms[TERM_KINETIC];
     sums[SUM_CHANGE] += terms[TERM_CHANGE];
     sums[SUM_SCALE] += terms[TERM_SCALE];
@@ -140,14 +149,10 @@ inline DEVICE void addClustersOfPieces(int numPartials, GLOBAL const mixed* REST
 
 // ------------------------------------------------------------------------------------- the numbers in the control block
 
-inline DEVICE wide monitorOf(const mixed* sum) {
-    return sqrt((wide) sum[0]*sqrt(sqrt((wide) sum[1])));
-}
-
 /** Whether the monitors are numbers. */
 inline DEVICE bool areMonitorsValid(const mixed* sums) {
     const wide largest = (wide) 1e30f;
-    return monitorOf(sums + SUM_ON_STEP) < largest && monitorOf(sums + SUM_HALF_STEP) < largest && sums[SUM_KINETIC] < largest;
+    return eighthRoot(sums[SUM_ON_STEP]) < largest && eighthRoot(sums[SUM_HALF_STEP]) < largest && sums[SUM_KINETIC] < largest;
 }
 
 inline DEVICE AutomaticChoice loadChoice(GLOBAL const wide* RESTRICT settings) {
@@ -167,8 +172,8 @@ inline DEVICE void acceptAutomaticStep(const mixed* sums, wide* now, GLOBAL cons
     AutomaticNumbers numbers;
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)
         ((wide*) &numbers)[i] = now[FIRST_NUMBER + i];
-    numbers.values[0] = monitorOf(sums + SUM_ON_STEP);
-    numbers.values[1] = monitorOf(sums + SUM_HALF_STEP);
+    numbers.values[0] = eighthRoot(sums[SUM_ON_STEP]);
+    numbers.values[1] = eighthRoot(sums[SUM_HALF_STEP]);
     if (now[IS_SHORTENED] == 0)
         automaticMoveOn(&numbers, references, &choice, kT);
     else {
@@ -190,7 +195,7 @@ inline DEVICE void changeAutomaticState(const mixed* sums, int change, wide* now
     AutomaticNumbers numbers;
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)
         ((wide*) &numbers)[i] = now[FIRST_NUMBER + i];
-    automaticChange(&numbers, now + FIRST_REFERENCE, &choice, kT, monitorOf(sums + SUM_ON_STEP), part);
+    automaticChange(&numbers, now + FIRST_REFERENCE, &choice, kT, eighthRoot(sums[SUM_ON_STEP]), part);
     if (change != VELOCITIES_CHANGED) // else the kick of the last step is in the half-step momentum
         now[DENSITY] = automaticDensity(&choice, numbers.behind);
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)

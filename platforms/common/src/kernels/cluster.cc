@@ -110,12 +110,25 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     mixed v[NUM_ATOMS][3], w[NUM_ATOMS], L[NUM_ENTRIES], x1[NUM_CONSTRAINTS];
     loadVectors_KIND(c, atoms, posq, posqCorrection, r);
     bool isRegular = true;
+#if UPDATE == AUTOMATIC
+    // All are read before the first is replaced, where registers suffice: a load waits for the stores before it.
+    const bool areFew = (NUM_CONSTRAINTS < 5);
+    mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
+    LastForce lastForce[NUM_ATOMS];
+    if (areFew)
+        UNROLL for (int i = 0; i < NUM_ATOMS; i++)
+            lastForce[i] = loadLastForce(last, paddedNumAtoms, atoms[ATOM_BASE + i*NUM_CLUSTERS + c]);
+#endif
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
         mixed a[3];
         const bool isReady = (NUM_CONSTRAINTS > 4 && (i == 0 ? (mixed) r[0] : v[i == 0 ? 0 : i - 1][0]) > 0);
         w[i] = loadVelocity(AGAIN(isReady, velm), atom, v[i]);
         isRegular = loadAcceleration(AGAIN(isReady, force), paddedNumAtoms, atom, w[i], a) >= 0 && isRegular;
+#if UPDATE == AUTOMATIC
+        if (areFew)
+            followForce(terms, last, lastForce[i], force, paddedNumAtoms, atom, w[i], v[i]);
+#endif
         UNROLL for (int d = 0; d < 3; d++)
             v[i][d] += kick*a[d];
     }
@@ -132,7 +145,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 #endif
     solve_KIND(L, x1);
     push_KIND(r, w, x1, -1, v);
-    const bool isPushed = x1[0] > 0;
+    const bool isPushed = (x1[0] > 0 && (UPDATE != AUTOMATIC || NUM_CONSTRAINTS > 4));
     measure_KIND(c, paddedNumAtoms, atoms, AGAIN(isPushed, force), r, L, v, w, x1, sums);
     UNROLL for (int k = 0; k < NUM_CONSTRAINTS; k++) {
         multipliers[LENGTH_BASE + k*NUM_CLUSTERS + c] = x1[k];
@@ -148,12 +161,15 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
     isRegular = addCluster(sums, share) && isRegular;
 #endif
 #if UPDATE == AUTOMATIC
-    mixed net[3] = {x1[0], 0, 0}, terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
+    mixed net[3] = {x1[0], 0, 0};
     UNROLL for (int i = 0; i < NUM_ATOMS; i++) {
         const int atom = atoms[ATOM_BASE + i*NUM_CLUSTERS + c];
-        const mixed4 before = AGAIN((NUM_CONSTRAINTS < 5 ? x1[0] : net[0]) > 0, velm)[atom];
-        followForce(terms, last, force, paddedNumAtoms, atom, w[i], before.x, before.y, before.z);
-        addFlight(terms, loadNetAcceleration_KIND(i, AGAIN((NUM_CONSTRAINTS < 5 ? x1[0] : net[0]) > 0, force), paddedNumAtoms, atom, r, w[i], x1, net), v[i]);
+        if (!areFew) {
+            mixed before[3];
+            loadVelocity(AGAIN(net[0] > 0, velm), atom, before);
+            followForce(terms, last, loadLastForce(last, paddedNumAtoms, atom), force, paddedNumAtoms, atom, w[i], before);
+        }
+        addFlight(terms, loadNetAcceleration_KIND(i, AGAIN(!areFew && net[0] > 0, force), paddedNumAtoms, atom, r, w[i], x1, net), v[i]);
         addAutomaticTerms(terms, last, atom, w[i], v[i], net);
     }
     addCluster(sums, terms, last, atoms[ATOM_BASE + c]);

@@ -350,7 +350,8 @@ inline DEVICE bool addClustersOfPart(const Part* part, GLOBAL const mixed* v, GL
         const mixed forceSquared = loadAcceleration(force, paddedNumAtoms, atom, w, applied);
         for (int j = 0; j < CLUSTER_TERM_COUNT; j++)
             terms[j] = 0;
-        followForce(terms, last, force, paddedNumAtoms, atom, w, part->before[3*i], part->before[3*i+1], part->before[3*i+2]);
+        const mixed halfStep[3] = {part->before[3*i], part->before[3*i+1], part->before[3*i+2]};
+        followForce(terms, last, loadLastForce(last, paddedNumAtoms, atom), force, paddedNumAtoms, atom, w, halfStep);
         addFlight(terms, forceSquared, u);
         addAutomaticTerms(terms, last, atom, w, u, a);
 #else

@@ -675,7 +675,8 @@ inline DEVICE int runPiece(const int mode, int piece, LargeTask task, LARGE_PARA
                     const int atom = pieceAtoms[firstAtom+i];
                     UNROLL for (int d = 0; d < 3; d++)
                         a[d] -= w*push[d];
-                    followForce(sums, task.last, force, paddedNumAtoms, atom, w, before[3*i], before[3*i+1], before[3*i+2]);
+                    const mixed halfStep[3] = {before[3*i], before[3*i+1], before[3*i+2]};
+                    followForce(sums, task.last, loadLastForce(task.last, paddedNumAtoms, atom), force, paddedNumAtoms, atom, w, halfStep);
                     addFlight(sums, forceSquared, v);
                     addAutomaticTerms(sums, task.last, atom, w, v, a);
                 }

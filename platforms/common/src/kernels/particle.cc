@@ -21,7 +21,7 @@ inline DEVICE bool finish_KIND(CLUSTER_PARAMETERS, mixed kick, mixed halfKick, b
 #endif
 #if UPDATE == AUTOMATIC
     mixed terms[NUM_TERMS] = {0, 0, 0, 0, 0, 0};
-    followForce(terms, last, force, paddedNumAtoms, atom, inverseMass, w[0], w[1], w[2]);
+    followForce(terms, last, loadLastForce(last, paddedNumAtoms, atom), force, paddedNumAtoms, atom, inverseMass, w);
     addFlight(terms, forceSquared, v);
     addAutomaticTerms(terms, last, atom, inverseMass, v, a);
     addCluster(sums, terms, last, atom);

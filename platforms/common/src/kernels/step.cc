@@ -10,6 +10,8 @@
 #define UNROLL _Pragma("unroll")
 // Loops that a compiler might write out many times over: what does not fit into the instruction cache costs more.
 #define KEEP_LOOP _Pragma("unroll 1")
+// The same for functions.
+#define SELDOM __attribute__((noinline))
 
 typedef WIDE wide;
 typedef unsigned int word_t;
@@ -82,6 +84,20 @@ inline DEVICE wide unstretch(wide y, wide a) {
 
 POWER_FUNCTIONS
 
+/**
+ * Sums of the fourth powers of A_c, of 2^-16 of it, so that they have room in a float: from 6e-6 to 20,000 thermal units (section 5 of
+ * docs/automatic_method.md) for U at 2 fs. Above that nothing is added but the largest power; what is no number stays so.
+ */
+inline DEVICE void addFourthPower(mixed* sum, mixed x) {
+    const mixed scaled = x/65536, square = scaled*scaled;
+    *sum += (scaled > LARGEST_OF_FOURTH_POWERS && x < (mixed) 1e37f ? LARGEST_FOURTH_POWER : square*square);
+}
+
+/** U = (sum A_c^4)^(1/8) */
+inline DEVICE wide eighthRoot(mixed sum) {
+    return 256*sqrt(sqrt(sqrt((wide) sum)));
+}
+
 /** Add what one constraint gives to the sums of the monitors: lambda is that of g = (|r|^2 - L^2)/2, rightSide is K lambda. */
 inline DEVICE void addConstraintTerms(mixed* sums, mixed lambda, mixed rightSide) {
     CONSTRAINT_TERMS
@@ -134,7 +150,7 @@ inline DEVICE wide evaluateMonitors(const mixed* sums, wide groupEnergy, GLOBAL 
 inline DEVICE void mergeInGroup(mixed* sums, LOCAL_ARG mixed* buffer) {
     for (int j = 0; j < NUM_SUMS; j++)
         buffer[j*GROUP_SIZE + LOCAL_ID] = sums[j];
-    for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
+    KEEP_LOOP for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
         SYNC_THREADS;
         if (LOCAL_ID < width) {
             mixed other[NUM_SUMS];
@@ -278,7 +294,7 @@ CLUSTER_FUNCTIONS
 inline DEVICE void addInGroup(mixed* numbers, const int count, LOCAL_ARG mixed* buffer) {
     for (int j = 0; j < count; j++)
         buffer[j*GROUP_SIZE + LOCAL_ID] = numbers[j];
-    for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
+    KEEP_LOOP for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
         SYNC_THREADS;
         if (LOCAL_ID < width)
             for (int j = 0; j < count; j++)
