@@ -85,7 +85,7 @@ public:
         automatic.getControl().setReferenceTemperature(findings.referenceTemperature);
     }
     long long getNumIterations() const {
-        return solver.getNumIterations();
+        return constraints.getNumIterations();
     }
     long long getNumRescues() const {
         return control->getNumRescues();

@@ -44,11 +44,6 @@ struct StepDensity {
     double limit(double u) const {
         return (lower + upperSlope * u) / (1 + curve * u);
     }
-    /** dB/du. */
-    double limitDerivative(double u) const {
-        const double denominator = 1 + curve * u;
-        return (upperSlope - lower * curve) / (denominator * denominator);
-    }
 
     /** rho[n+1/2] of the update Explicit (3.15): 2u - rho[n-1/2]; not necessarily positive. */
     static double sumUpdate(double u, double previous) {

@@ -65,9 +65,8 @@ bool StepMonitor::useVelocities(const vector<Term>& terms) {
 }
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
-        solver(solver), system(solver.getSystem()), forceSquares(solver), toSolve(system.getNumConstraints()),
-        solved(toSolve) {
-    trial = {toSolve, toSolve};
+        solver(solver), system(solver.getSystem()), forceSquares(solver),
+        trial{Values(system.getNumConstraints()), Values(system.getNumConstraints())} {
     for (Seen* each : {&seen, &seenHalf})
         each->works = each->squares = Values(solver.getNumRanges());
 }
@@ -262,67 +261,4 @@ double StepMonitor::combineUnbounded(const Values& of) const {
         sumOfWeights += terms[i].weight * terms[i].weight;
     }
     return std::sqrt(sum / sumOfWeights);
-}
-
-double StepMonitor::evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
-                                     Vectors& gradient) {
-    const vector<double>& masses = system.getMasses();
-    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
-    std::fill(gradient.begin(), gradient.end(), Vec3());
-    // du/dLambda is collected in two parts: y, which needs a product with K^-1, and x, which is K^-1 du/dLambda already.
-    std::fill(toSolve.begin(), toSolve.end(), 0.0);
-    std::fill(solved.begin(), solved.end(), 0.0);
-    const double u = combineUnbounded(values);
-    double sumOfWeights = 0, changeWithRates = 0;
-    for (const Term& each : terms)
-        sumOfWeights += each.weight * each.weight;
-    for (size_t k = 0; k < terms.size(); k++) {
-        const Term& term = terms[k];
-        const Parts parts = PARTS[term.kind];
-        const double value = values[k];
-        // U is not differentiable at zero; any derivative serves, since it only guides the iteration.
-        if (!(value > 0) || !(u > 0) || term.reference == 0)
-            continue;
-        const double t = term.weight * std::pow(value / term.reference, term.power);
-        const double factor = t * t * term.power / (value * u * sumOfWeights); // du/dU_k
-        if (parts.multipliers)
-            for (int j = 0; j < numConstraints; j++) {
-                const double d = system.toGivenMultiplier(j), x = d * trial.multipliers[j] / value;
-                const double order = parts.norm == Power ? term.order : 2.0;
-                toSolve[j] += factor * d * std::copysign(std::pow(std::fabs(x), order - 1), x);
-            }
-        if (parts.constraintForce) // dU/dLambda = K Lambda/U
-            for (int j = 0; j < numConstraints; j++)
-                solved[j] += factor / value * trial.multipliers[j];
-        if (parts.velocity == No)
-            continue;
-        int first = 0, end = numParticles;
-        if (parts.norm == Largest) {
-            auto size = [&](int i) {
-                return masses[i] > 0 ? v[i].dot(v[i]) + state.force[i].dot(state.force[i]) : -1.0;
-            };
-            for (int i = 1; i < numParticles; i++)
-                if (size(i) > size(first))
-                    first = i;
-            end = first + 1;
-        }
-        for (int i = first; i < end; i++)
-            if (masses[i] > 0)
-                gradient[i] += v[i] * (factor / value * (parts.velocity == Mass ? masses[i] : 1.0));
-    }
-    if (anyOf(terms, [](const Parts& parts) { return parts.ofConstraints(); })) {
-        // dLambda/dv = 2 K^-1 G(v), so du/dv = 2 G(v)^T K^-1 du/dLambda
-        solver.solveMatrix(toSolve);
-        for (int j = 0; j < numConstraints; j++)
-            solved[j] = 2 * (solved[j] + toSolve[j]);
-        solver.addVelocityJacobianTransposed(v, theta, solved, gradient);
-        if (theta.isMoving) {
-            solver.findChangeWithRates(v, theta, toSolve);
-            changeWithRates = 0.5 * sumOf(numConstraints, [&](int j) { return solved[j] * toSolve[j]; });
-        }
-    }
-    const double slope = bounds.limitDerivative(u);
-    for (Vec3& each : gradient)
-        each *= slope;
-    return changeWithRates * slope;
 }

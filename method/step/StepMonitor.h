@@ -14,12 +14,11 @@
 namespace OpenMMVRattle {
 
 /**
- * The monitors U_k(q,p) of docs/method.md, section 4, their combination
+ * The monitors U_k(q,p) of docs/method.md, section 4, and their combination
  *
- *     u = B(sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2)),
+ *     u = B(sqrt(sum_k (w_k (U_k/U_k,ref)^power_k)^2 / sum_k w_k^2)).
  *
- * and the derivative of u with respect to the velocities, at fixed positions. A monitor sees q only through the applied
- * force F, through the multipliers Lambda(q,p) and through the energy of a force group.
+ * A monitor sees q only through the applied force F, through the multipliers Lambda(q,p) and through the energy of a force group.
  */
 class StepMonitor : public ConstraintSolver::Observer {
 public:
@@ -92,13 +91,6 @@ public:
     double combine(const Values& of) const {
         return bounds.limit(combineUnbounded(of));
     }
-    /**
-     * du/dv at the trial that was evaluated last, with the chain rule through Lambda (Lemma 4.2).
-     *
-     * @return how u changes with the logarithm of the rates of parameters that move
-     */
-    double evaluateGradient(const StepState& state, const Vectors& v, const ExpressionParameters& theta,
-                            Vectors& gradient);
 
 private:
     /** Multipliers, and over each range of them the sums of Lambda_k (K Lambda)_k and of (d_k Lambda_k)^2 in users' units. */
@@ -119,7 +111,7 @@ private:
     ForceSquares forceSquares;
     Seen seen, seenHalf;
     ConstraintSolver::HalfStep trial;
-    Values values, toSolve, solved;
+    Values values;
 };
 
 } // namespace OpenMMVRattle

@@ -45,7 +45,7 @@ public:
         double rate; // of u along F - G^T Lambda
         double fallBack; // a rho+ to begin with where that of (3.15) is not positive
     };
-    /** Solve (3.9)-(3.11) and (3.14) together, by chord iterations and where these fail by Newton's; rhoNext is found too. */
+    /** Solve (3.9)-(3.11) and (3.14) together, by chord iterations or, where these fail, a search for rhoNext; it is found too. */
     bool solve(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
     /** Say why the last of these failed. */
     std::string explainFailure();
@@ -56,23 +56,19 @@ public:
     double size; // ps
     /** It has become the last step. */
     void accept(StepState& last);
-    long long getNumIterations() const {
-        return constraints.getNumIterations() + numNewtonIterations;
-    }
 
 private:
     ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
+    ConstraintSolver::Trial regularTrial(double rho, double rhoNext);
     ConstraintSolver::Guess regularGuess() const;
     bool solveByChord(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
-    bool solveByNewton(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
+    bool searchDensity(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
     ConstraintSolver& constraints;
     const StepState& now;
-    double h, tolerance;
+    double h, tolerance, densityTolerance;
     bool isFromOnStep;
     double lastDrift; // of the last trial
-    std::vector<double> correction, coupling, response;
-    std::vector<OpenMM::Vec3> gradient, halfStepChange;
-    long long numNewtonIterations; // those of (3.14)
+    std::vector<double> lastSolved; // lambda in the search for a density
 };
 
 } // namespace OpenMMVRattle
