@@ -13,6 +13,7 @@
 #include "constraints/Sum.h"
 #include "openmm/Vec3.h"
 #include <algorithm>
+#include <cmath>
 #include <string>
 #include <vector>
 
@@ -135,6 +136,14 @@ public:
         return SharedWork::getNumRanges(count) == 0
                    ? 0.0
                    : *std::max_element(rangeResults.begin(), rangeResults.begin() + SharedWork::getNumRanges(count));
+    }
+
+    /** (sum |x|^p)^(1/p) for such, scaled by the largest |x| so that no power overflows. */
+    template <class Size> double pNorm(int count, double order, const Size& size) {
+        const double most = largest(count, size);
+        if (most == 0)
+            return 0;
+        return most * std::pow(sum(count, [&](int i) { return std::pow(size(i) / most, order); }), 1 / order);
     }
 
     /** The sum of weight x^2 over the particles with mass. */

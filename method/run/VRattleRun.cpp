@@ -5,6 +5,7 @@
 #include "run/IntegratorSettings.h"
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 using namespace OpenMMVRattle;
 using OpenMM::Vec3;
@@ -15,7 +16,46 @@ namespace {
 // Keeps what is at rest from being divided by zero.
 const double TINY = 1e-100;
 
+vector<double> givenReferences(const StepSettings& settings) {
+    if (settings.isAutomatic)
+        return {std::begin(settings.automaticReferences), std::end(settings.automaticReferences)};
+    vector<double> references;
+    for (const StepMonitor::Term& term : settings.terms)
+        references.push_back(term.reference);
+    return references;
+}
+
+bool haveSameMonitors(const StepSettings& a, const StepSettings& b) {
+    auto areAlike = [](const StepMonitor::Term& x, const StepMonitor::Term& y) {
+        return x.kind == y.kind && x.weight == y.weight && x.power == y.power && x.order == y.order;
+    };
+    if (a.isAutomatic != b.isAutomatic || a.isFixedStep != b.isFixedStep)
+        return false;
+    return a.isAutomatic ? a.automaticRequest == b.automaticRequest
+                         : std::equal(a.terms.begin(), a.terms.end(), b.terms.begin(), b.terms.end(), areAlike);
+}
+
+// But for what automatic step control has no use for.
+bool haveSameSizes(const StepSettings& a, const StepSettings& b) {
+    return a.stepSize == b.stepSize && a.getMinimumStep() == b.getMinimumStep() &&
+           (a.isAutomatic || (a.getMaximumStep() == b.getMaximumStep() && a.update == b.update));
+}
+
 } // namespace
+
+void VRattleRun::setSettings(const Settings& newSettings) {
+    const bool areSameMonitors = haveSameMonitors(newSettings, settings);
+    const vector<double> given = givenReferences(settings), inForce = control->getReferences();
+    vector<double> references = givenReferences(newSettings);
+    for (size_t k = 0; k < references.size() && areSameMonitors; k++)
+        if (references[k] == 0 && given[k] == 0)
+            references[k] = inForce[k];
+    VRattleDynamics::setSettings(newSettings, references,
+                                 !areSameMonitors                       ? StepControl::Monitors
+                                 : references != inForce                ? StepControl::References
+                                 : haveSameSizes(newSettings, settings) ? StepControl::Nothing
+                                                                        : StepControl::Sizes);
+}
 
 StepCounts VRattleRun::getCounts() {
     StepCounts counts;

@@ -38,6 +38,8 @@ public:
     const Settings& getSettings() const {
         return settings;
     }
+    /** Take over settings. A reference of 0 stands for the one in force, if that has been found for the same monitors. */
+    void setSettings(const Settings& newSettings);
 
     // ------------------------------------------------------------------------------------- what others see of the state
 

@@ -20,30 +20,18 @@ AutomaticControl::State AutomaticSteps::stateOf(const StepState& state) {
     return {state.q, state.theta, state.v, state.force, state.lambda};
 }
 
-// A reference of 0 stands for the one in force, if it is still.
-bool AutomaticSteps::setSettings(const StepSettings& newSettings, bool isInForce) {
-    bool mustBegin = !isInForce;
-    for (int k = 0; k < AutomaticControl::NUM_MONITORS; k++) {
-        const double given = newSettings.automaticReferences[k], old = control.getReference(k);
-        const bool isKept = isInForce && settings.automaticReferences[k] == 0 &&
-                            newSettings.automaticRequest == settings.automaticRequest;
-        const double reference = given == 0 && isKept ? old : given;
-        mustBegin = mustBegin || reference != old;
-        control.setReference(k, reference);
-    }
-    const bool mustForget = mustBegin || newSettings.isFixedStep != settings.isFixedStep;
-    const bool goesOn = !mustForget && newSettings.stepSize == settings.stepSize &&
-                        newSettings.getMinimumStep() == settings.getMinimumStep();
+void AutomaticSteps::changeSettings(const StepSettings& newSettings, const vector<double>& references,
+                                    SettingsChange change) {
+    setReferences(references);
     applySettings(newSettings);
-    if (goesOn || now.q.empty())
-        return true;
-    if (mustBegin)
+    if (change == Nothing || now.q.empty())
+        return;
+    if (change != Sizes) {
         control.begin(stateOf(now));
-    if (mustForget)
         forgetDensity();
+    }
     if (hasDensity)
         rho = control.getLast(); // which the bound may have changed
-    return false;
 }
 
 void AutomaticSteps::applySettings(const StepSettings& newSettings) {

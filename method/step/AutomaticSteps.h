@@ -22,7 +22,8 @@ public:
     std::vector<double> getReferences() const override;
     void setReferences(const std::vector<double>& references) override;
     void applySettings(const StepSettings& newSettings) override;
-    bool setSettings(const StepSettings& newSettings, bool isInForce) override;
+    void changeSettings(const StepSettings& newSettings, const std::vector<double>& references,
+                        SettingsChange change) override;
     void change(ChangeKind kind, double part) override;
     void reverse() override;
     bool start() override;

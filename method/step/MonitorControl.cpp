@@ -22,35 +22,20 @@ void MonitorControl::applySettings(const StepSettings& newSettings) {
     monitor.setTerms(settings.terms, recursion);
 }
 
-bool MonitorControl::setSettings(const StepSettings& newSettings, bool isInForce) {
-    const bool areSameMonitors =
-        isInForce && newSettings.isFixedStep == settings.isFixedStep &&
-        std::equal(newSettings.terms.begin(), newSettings.terms.end(), settings.terms.begin(), settings.terms.end(),
-                   [](const StepMonitor::Term& a, const StepMonitor::Term& b) { return a.isLike(b); });
-    const vector<double> inForce = monitor.getReferences();
-    vector<double> references;
-    for (size_t k = 0; k < newSettings.terms.size(); k++) {
-        const double given = newSettings.terms[k].reference;
-        const bool isTaken = given == 0 && areSameMonitors && settings.terms[k].reference == 0;
-        references.push_back(isTaken ? inForce[k] : given); // taken at the first step, and so it stays
-    }
-    const bool goesOn = areSameMonitors && references == inForce && newSettings.stepSize == settings.stepSize &&
-                        newSettings.getMinimumStep() == settings.getMinimumStep() &&
-                        newSettings.getMaximumStep() == settings.getMaximumStep() &&
-                        newSettings.update == settings.update;
-    const double oldU = areSameMonitors && hasDensity ? monitor.combine(now.values) : 0.0;
+void MonitorControl::changeSettings(const StepSettings& newSettings, const vector<double>& references,
+                                    SettingsChange change) {
+    const double oldU = hasDensity ? monitor.combine(now.values) : 0.0;
     applySettings(newSettings);
-    setReferences(references);
-    if (goesOn || now.q.empty())
-        return true;
+    monitor.references = references;
+    if (change == Nothing || now.q.empty())
+        return;
     monitor.look(now, true);
     hasHalfStepValue = false;
     rate = 0;
-    if (areSameMonitors && std::count(references.begin(), references.end(), 0.0) == 0)
-        rescaleDensity(oldU);
-    else
+    if (change == Monitors || std::count(references.begin(), references.end(), 0.0) > 0)
         forgetDensity();
-    return false;
+    else
+        rescaleDensity(oldU);
 }
 
 // ------------------------------------------------------------------------------------------------- between two steps

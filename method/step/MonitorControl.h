@@ -19,16 +19,17 @@ public:
         return now.values;
     }
     std::vector<double> getReferences() const override {
-        return monitor.getReferences();
+        return monitor.references;
     }
     void setReferences(const std::vector<double>& references) override {
-        monitor.setReferences(references);
+        monitor.references = references;
     }
     long long getNumRescues() const override {
         return numRescues;
     }
     void applySettings(const StepSettings& newSettings) override;
-    bool setSettings(const StepSettings& newSettings, bool isInForce) override;
+    void changeSettings(const StepSettings& newSettings, const std::vector<double>& references,
+                        SettingsChange change) override;
     void change(ChangeKind kind, double part) override;
     void reverse() override;
     void solve() override;

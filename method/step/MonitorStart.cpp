@@ -42,23 +42,23 @@ double MonitorStart::findDensity(double stepSize) {
     isCalm = false;
     if (firstDensity > 0)
         return firstDensity;
-    const vector<StepMonitor::Term>& terms = monitor.getTerms();
+    const vector<double>& references = monitor.references;
     double farthest = 0;
     for (int i : constraints.getMovingParticles())
         farthest = std::max(farthest, std::sqrt(now.q[i].dot(now.q[i])));
     const double speed = std::numeric_limits<double>::epsilon() * farthest / stepSize;
     size_t numNegligible = 0, numKnown = 0;
-    isNegligible.resize(terms.size());
-    for (size_t k = 0; k < terms.size(); k++) {
-        const bool isKnown = terms[k].reference > 0;
+    isNegligible.resize(references.size());
+    for (size_t k = 0; k < references.size(); k++) {
+        const bool isKnown = references[k] > 0;
         isNegligible[k] = monitor.isNegligible(k, now, speed, speed / stepSize);
         isCalm = isCalm || (isNegligible[k] && !isKnown);
         numNegligible += isNegligible[k];
         numKnown += isKnown;
     }
-    const bool areAllNegligible = numNegligible == terms.size();
+    const bool areAllNegligible = numNegligible == references.size();
     isCalm = isCalm || areAllNegligible;
-    const bool isGiven = !areAllNegligible && numKnown > 0 && (numKnown == terms.size() || isCalm);
+    const bool isGiven = !areAllNegligible && numKnown > 0 && (numKnown == references.size() || isCalm);
     return triedDensity = isGiven ? monitor.combine(now.values) : 1.0;
 }
 
@@ -113,10 +113,10 @@ bool MonitorStart::measure() {
     if (isCalm || firstDensity > 0)
         return true;
     const vector<double>& ahead = solver.next.values;
-    referencesBefore = monitor.getReferences();
+    referencesBefore = monitor.references;
     for (size_t k = 0; k < ahead.size(); k++)
         if (referencesBefore[k] == 0)
-            monitor.setReference(k, startValue(startValues[k], ahead[k], hasBack ? &back.values[k] : nullptr));
+            monitor.references[k] = startValue(startValues[k], ahead[k], hasBack ? &back.values[k] : nullptr);
     if (std::count(referencesBefore.begin(), referencesBefore.end(), 0.0) == (int) ahead.size()) {
         if (hasBack)
             scaleReferences();
@@ -131,24 +131,24 @@ bool MonitorStart::accept() {
     firstDensity = 0;
     const vector<double>& values = solver.next.values; // of the state before the step
     for (size_t k = 0; k < values.size() && isCalm; k++)
-        if (monitor.getTerms()[k].reference == 0 && !isNegligible[k])
-            monitor.setReference(k, values[k]);
+        if (monitor.references[k] == 0 && !isNegligible[k])
+            monitor.references[k] = values[k];
     return !isCalm;
 }
 
 void MonitorStart::abandon() {
     if (firstDensity > 0)
-        monitor.setReferences(referencesBefore);
+        monitor.references = referencesBefore;
     firstDensity = 0;
 }
 
 // With rho[1/2] = 1 the steps to either side have the size h, and not h/u0, so that the change of u over a step of the
 // sequence is theirs over u0. Scale the references such that u0 + (u1 - u-1)/(4 u0) = 1.
 void MonitorStart::scaleReferences() {
-    const vector<double> references = monitor.getReferences();
+    const vector<double> smooth = monitor.references;
     auto mismatchOf = [&](double scale) {
-        for (size_t k = 0; k < references.size(); k++)
-            monitor.setReference(k, scale * references[k]);
+        for (size_t k = 0; k < smooth.size(); k++)
+            monitor.references[k] = scale * smooth[k];
         const double start = monitor.combine(startValues);
         return start + 0.25 * (monitor.combine(solver.next.values) - monitor.combine(back.values)) / start - 1;
     };

@@ -31,6 +31,8 @@ class StepControl : protected StepMemory {
 public:
     /** What has been changed between two steps. */
     enum ChangeKind { Everything, Forces, Velocities, Frame };
+    /** What about settings: steps and bounds; the references of the same monitors; or these themselves. */
+    enum SettingsChange { Nothing, Sizes, References, Monitors };
     StepControl(ConstraintSolver& constraints, StepSolver& solver, StepState& now) :
             constraints(constraints), solver(solver), now(now), settings(), rhoNext(1) {
     }
@@ -60,13 +62,9 @@ public:
     }
     /** Take over settings and nothing else: where memory and references are those that belong to them. */
     virtual void applySettings(const StepSettings& newSettings) = 0;
-    /**
-     * Take over settings. Where there is a state, the densities go on from there if the new settings allow it.
-     *
-     * @param isInForce    whether this control has been in force so far
-     * @return whether everything goes on as if nothing had happened; if not, the half-step momentum is formed anew
-     */
-    virtual bool setSettings(const StepSettings& newSettings, bool isInForce) = 0;
+    /** Take over settings, with the references that belong to them. Where there is a state, the density goes on if it can. */
+    virtual void changeSettings(const StepSettings& newSettings, const std::vector<double>& references,
+                                SettingsChange change) = 0;
 
     /** The state is one that no step has led to: there is no density. Fails as change() does. */
     void begin() {

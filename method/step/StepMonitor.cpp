@@ -46,10 +46,6 @@ bool anyOf(const vector<StepMonitor::Term>& terms, bool (*isWanted)(const Parts&
                        [&](const StepMonitor::Term& term) { return isWanted(PARTS[term.kind]); });
 }
 
-double total(const vector<double>& parts) {
-    return sumOf((int) parts.size(), [&](int k) { return parts[k]; });
-}
-
 } // namespace
 
 bool StepMonitor::needConstraints(const vector<Term>& terms) {
@@ -65,76 +61,40 @@ bool StepMonitor::useVelocities(const vector<Term>& terms) {
 }
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
-        solver(solver), system(solver.getSystem()), forceSquares(solver),
+        solver(solver), system(solver.getSystem()), forceSquares(solver), seen(solver), seenHalf(solver),
         trial{Values(system.getNumConstraints()), Values(system.getNumConstraints())} {
-    for (Seen* each : {&seen, &seenHalf})
-        each->works = each->squares = Values(solver.getNumRanges());
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms, const StepDensity& newBounds) {
     terms = newTerms;
     bounds = newBounds;
-    forceSquares.setOverMassWanted(anyOf(terms, [](const Parts& parts) { return parts.force == OverMass; }));
-}
-
-vector<double> StepMonitor::getReferences() const {
-    Values references;
+    references.clear();
     for (const Term& term : terms)
         references.push_back(term.reference);
-    return references;
-}
-
-void StepMonitor::setReferences(const Values& references) {
-    for (size_t k = 0; k < references.size(); k++)
-        setReference(k, references[k]);
+    forceSquares.setOverMassWanted(anyOf(terms, [](const Parts& parts) { return parts.force == OverMass; }));
+    const bool areSquaresWanted =
+        anyOf(terms, [](const Parts& parts) { return parts.multipliers && parts.norm == Square; });
+    seen.setSquaresWanted(areSquaresWanted);
+    seenHalf.setSquaresWanted(areSquaresWanted);
 }
 
 // ---------------------------------------------------------------------------------------------------- what is observed
 
 ConstraintSolver::Coupled StepMonitor::observeTrial(const ExpressionParameters& theta) {
-    seen.multipliers = &trial.multipliers;
-    seen.rightSide = &trial.rightSide;
-    seenHalf.multipliers = nullptr;
+    seen.observe(trial.multipliers, trial.rightSide);
+    seenHalf.ignore();
     return {theta, trial.multipliers, trial.rightSide};
 }
 
 void StepMonitor::observe(const ConstraintSolver::OnStep& end) {
     forceSquares.observe(end.forces);
-    seen.multipliers = &end.multipliers;
-    seen.rightSide = &end.rightSide;
-    seenHalf.multipliers = end.atHalfStep == nullptr ? nullptr : &end.atHalfStep->multipliers;
-    seenHalf.rightSide = end.atHalfStep == nullptr ? nullptr : &end.atHalfStep->rightSide;
-}
-
-void StepMonitor::seeParticles(int block) {
-    forceSquares.seeParticles(block);
-}
-
-void StepMonitor::seeConstraints(int range, int first, int end) {
-    const bool areSquaresWanted =
-        anyOf(terms, [](const Parts& parts) { return parts.multipliers && parts.norm == Square; });
-    for (Seen* each : {&seen, &seenHalf}) {
-        if (each->multipliers == nullptr)
-            continue;
-        const double *lambda = each->multipliers->data() + first, *right = each->rightSide->data() + first;
-        each->works[range] = sumOf(end - first, [&](int k) { return lambda[k] * right[k]; });
-        if (areSquaresWanted)
-            each->squares[range] = sumOf(end - first, [&](int k) {
-                const double given = system.toGivenMultiplier(first + k) * lambda[k];
-                return given * given;
-            });
-    }
+    seen.observe(end.multipliers, end.rightSide);
+    seenHalf.ignore();
+    if (end.atHalfStep != nullptr)
+        seenHalf.observe(end.atHalfStep->multipliers, end.atHalfStep->rightSide);
 }
 
 // ---------------------------------------------------------------------------------------------------------- the values
-
-// (sum |x|^p)^(1/p), scaled by the largest |x| so that no power overflows.
-template <class Size> double StepMonitor::pNorm(int count, double order, const Size& size) const {
-    const double largest = solver.largest(count, size);
-    if (largest == 0)
-        return 0;
-    return largest * std::pow(solver.sum(count, [&](int i) { return std::pow(size(i) / largest, order); }), 1 / order);
-}
 
 // The square of what is a sum of squares, and else the norm itself, unless that takes velocities too.
 void StepMonitor::takeForces(StepState& state) {
@@ -150,7 +110,7 @@ void StepMonitor::takeForces(StepState& state) {
         else if (parts.norm == Square && parts.force != No)
             part = parts.force == One ? forceSquares.getSum() : forceSquares.getSumOverMass();
         else if (parts.norm == Power && parts.force == One)
-            part = pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(square(i)); });
+            part = solver.pNorm(numParticles, terms[k].order, [&](int i) { return std::sqrt(square(i)); });
         else if (parts.norm == Largest && parts.velocity == No)
             part = std::sqrt(solver.largest(numParticles, square));
     }
@@ -162,10 +122,7 @@ void StepMonitor::evaluate(StepState& state) {
 }
 
 void StepMonitor::look(StepState& state, bool areForcesOthers) {
-    seen.multipliers = &state.lambda;
-    seen.rightSide = &state.rightSide;
-    seenHalf.multipliers = nullptr;
-    solver.forRanges([&](int range, int first, int end) { seeConstraints(range, first, end); });
+    seen.look(state.lambda, state.rightSide);
     if (areForcesOthers)
         takeForces(state);
     state.values = evaluate(state, state.v, seen);
@@ -182,16 +139,14 @@ const vector<double>& StepMonitor::evaluateTrial(const StepState& state, const V
 const vector<double>& StepMonitor::evaluateAt(const StepState& state, const Vectors& v,
                                               const ExpressionParameters& theta) {
     solver.findMultipliers(v, theta, trial.multipliers, trial.rightSide); // (4.3)
-    observeTrial(theta);
-    solver.forRanges([&](int range, int first, int end) { seeConstraints(range, first, end); });
+    seen.look(trial.multipliers, trial.rightSide);
     return evaluate(state, v, seen);
 }
 
-const vector<double>& StepMonitor::evaluate(const StepState& state, const Vectors& v, const Seen& from) {
-    // Lambda^T K Lambda; rounding could make it negative where it vanishes.
-    const double constraintForceSquared = std::max(total(from.works), 0.0);
-    const double multipliersSquared = total(from.squares);
-    const int numParticles = system.getNumParticles(), numConstraints = system.getNumConstraints();
+const vector<double>& StepMonitor::evaluate(const StepState& state, const Vectors& v,
+                                            const MultiplierSquares& squares) {
+    const double constraintForceSquared = squares.getWeightedSum(), multipliersSquared = squares.getSum();
+    const int numParticles = system.getNumParticles();
     const vector<double>& masses = system.getMasses();
     values.resize(terms.size());
     for (size_t k = 0; k < terms.size(); k++) {
@@ -205,8 +160,8 @@ const vector<double>& StepMonitor::evaluate(const StepState& state, const Vector
                                   (parts.multipliers ? multipliersSquared : 0.0) + forcePart +
                                   (parts.velocity != No ? solver.sum(numParticles, square) : 0.0));
         else if (parts.norm == Power && parts.multipliers)
-            values[k] = pNorm(numConstraints, terms[k].order,
-                              [&](int j) { return std::fabs(system.toGivenMultiplier(j) * (*from.multipliers)[j]); });
+            values[k] =
+                solver.pNorm(system.getNumConstraints(), terms[k].order, [&](int j) { return squares.sizeOf(j); });
         else if (parts.norm == Largest && parts.velocity != No)
             values[k] = std::sqrt(solver.largest(
                 numParticles, [&](int i) { return square(i) + forceSquares.squareOf(state.force[i], i); }));
@@ -255,7 +210,7 @@ double StepMonitor::combineUnbounded(const Values& of) const {
         return 1;
     double sum = 0, sumOfWeights = 0;
     for (size_t i = 0; i < terms.size(); i++) {
-        const double ratio = terms[i].reference > 0 ? of[i] / terms[i].reference : 1.0;
+        const double ratio = references[i] > 0 ? of[i] / references[i] : 1.0;
         const double t = terms[i].weight * std::pow(ratio, terms[i].power);
         sum += t * t;
         sumOfWeights += terms[i].weight * terms[i].weight;

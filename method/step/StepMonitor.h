@@ -6,6 +6,7 @@
 
 #include "constraints/ConstraintSolver.h"
 #include "constraints/ForceSquares.h"
+#include "constraints/MultiplierSquares.h"
 #include "openmm/Vec3.h"
 #include "step/StepDensity.h"
 #include "step/StepState.h"
@@ -38,12 +39,8 @@ public:
     struct Term {
         Kind kind;
         double weight, power;
-        double reference; // U_k,ref; 0 while it is not known
+        double reference; // U_k,ref, if it is given; else 0
         double order = 8; // p of the p-norms, of no meaning to others
-        /** Whether it is the same but for its reference. */
-        bool isLike(const Term& other) const {
-            return kind == other.kind && weight == other.weight && power == other.power && order == other.order;
-        }
     };
     typedef std::vector<OpenMM::Vec3> Vectors;
     typedef std::vector<double> Values;
@@ -55,16 +52,9 @@ public:
     static bool useVelocities(const std::vector<Term>& terms);
 
     explicit StepMonitor(ConstraintSolver& solver);
-    /** @param newBounds    B, through which u goes */
+    /** Take over terms, with their references. B is that of the bounds. */
     void setTerms(const std::vector<Term>& newTerms, const StepDensity& newBounds);
-    const std::vector<Term>& getTerms() const {
-        return terms;
-    }
-    Values getReferences() const;
-    void setReferences(const Values& references);
-    void setReference(size_t index, double value) {
-        terms[index].reference = value;
-    }
+    Values references; // U_k,ref in force, 0 while they are not known
 
     /** Let this be the solver's observer in a pass for trial velocities, which finds the multipliers of these; */
     ConstraintSolver::Coupled observeTrial(const ExpressionParameters& theta);
@@ -93,23 +83,22 @@ public:
     }
 
 private:
-    /** Multipliers, and over each range of them the sums of Lambda_k (K Lambda)_k and of (d_k Lambda_k)^2 in users' units. */
-    struct Seen {
-        const Values *multipliers = nullptr, *rightSide = nullptr;
-        Values works, squares;
-    };
-    void seeParticles(int block) override;
-    void seeConstraints(int range, int first, int end) override;
+    void seeParticles(int block) override {
+        forceSquares.seeParticles(block);
+    }
+    void seeConstraints(int range, int first, int end) override {
+        seen.seeConstraints(range, first, end);
+        seenHalf.seeConstraints(range, first, end);
+    }
     void takeForces(StepState& state);
-    const Values& evaluate(const StepState& state, const Vectors& v, const Seen& from);
-    template <class Size> double pNorm(int count, double order, const Size& size) const;
+    const Values& evaluate(const StepState& state, const Vectors& v, const MultiplierSquares& squares);
     double combineUnbounded(const Values& of) const;
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     std::vector<Term> terms;
     StepDensity bounds;
     ForceSquares forceSquares;
-    Seen seen, seenHalf;
+    MultiplierSquares seen, seenHalf;
     ConstraintSolver::HalfStep trial;
     Values values;
 };

@@ -29,14 +29,13 @@ StepControl& VRattleDynamics::controlOf(const Settings& which) {
     return monitors;
 }
 
-void VRattleDynamics::setSettings(const Settings& newSettings) {
-    StepControl& next = controlOf(newSettings);
-    const bool isInForce = control == &next;
+void VRattleDynamics::setSettings(const Settings& newSettings, const vector<double>& references,
+                                  StepControl::SettingsChange change) {
     settings = newSettings;
     solver.setSettings(settings.stepSize, settings.tolerance);
-    control = &next;
-    const bool goesOn = control->setSettings(settings, isInForce);
-    if (!goesOn && control->hasStarted())
+    control = &controlOf(settings);
+    control->changeSettings(settings, references, change);
+    if (change != StepControl::Nothing && control->hasStarted())
         formHalfStepVelocities();
 }
 

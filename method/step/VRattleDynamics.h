@@ -34,10 +34,11 @@ public:
     VRattleDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
                     const std::vector<ExpressionConstraint>& expressions = {});
     /**
-     * Take over settings. In the course of a run the density goes on where they allow it: it is scaled with u, and the
-     * half-step momentum is formed anew.
+     * Take over settings and references. In the course of a run the density goes on where the change allows it: it is scaled with u, and
+     * the half-step momentum is formed anew.
      */
-    void setSettings(const Settings& newSettings);
+    void setSettings(const Settings& newSettings, const std::vector<double>& references,
+                     StepControl::SettingsChange change);
     /**
      * Start afresh at a state. The velocities are projected onto the constraints, whose parameters, those in force, are at rest
      * and stay so until others are set.

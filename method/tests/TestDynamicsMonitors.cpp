@@ -107,7 +107,7 @@ void testCombination() {
     evaluation.u(e.velocities);
     vector<double> values = evaluation.values;
     for (int i = 0; i < 2; i++)
-        evaluation.monitor.setReference(i, values[i]);
+        evaluation.monitor.references[i] = values[i];
     ASSERT_EQUAL_TOL(1.0, evaluation.monitor.combine(values), 1e-14);
     double expected = std::sqrt((9 * 4.0 + 0.25 * 3.0) / 9.25); // U1 doubled; U2 trebled, to the power 1/2
     ASSERT_EQUAL_TOL(expected, evaluation.monitor.combine({2 * values[0], 3 * values[1]}), 1e-14);
