@@ -146,11 +146,17 @@ inline DEVICE wide evaluateMonitors(const mixed* sums, wide groupEnergy, GLOBAL 
     return valid ? (settings[LOWER] + settings[SLOPE]*u)/(1 + settings[CURVE]*u) : (wide) -1;
 }
 
+#if HALF_SUMS // where a loop that is kept costs the largest clusters their last register
+#define MERGE_LOOP
+#else
+#define MERGE_LOOP KEEP_LOOP
+#endif
+
 /** Merge the sums of all threads of a work group; thread 0 gets the result. */
 inline DEVICE void mergeInGroup(mixed* sums, LOCAL_ARG mixed* buffer) {
     for (int j = 0; j < NUM_SUMS; j++)
         buffer[j*GROUP_SIZE + LOCAL_ID] = sums[j];
-    KEEP_LOOP for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
+    MERGE_LOOP for (int width = GROUP_SIZE/2; width > 0; width /= 2) {
         SYNC_THREADS;
         if (LOCAL_ID < width) {
             mixed other[NUM_SUMS];
