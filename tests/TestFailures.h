@@ -292,6 +292,40 @@ inline void testStepsThatAreTooLarge() {
                 }
 }
 
+// A pull that makes everything faster by 220 nm/fs in each step, as what is far beyond the limit of stability becomes: the fifth would
+// be faster than three times light. References out of reach keep automatic step control from shortening steps.
+inline void testFasterThanLight() {
+    const double size = 0.004;
+    System system;
+    auto* pull = new CustomExternalForce("-5.5e8*x");
+    vector<Vec3> positions;
+    for (int i = 0; i < 3; i++) {
+        system.addParticle(10);
+        pull->addParticle(i);
+        positions.push_back(Vec3(0.1 * i, 0.2, 0.3));
+    }
+    system.addConstraint(0, 1, 0.1);
+    system.addForce(pull);
+    Integrator_ integrator(size);
+    integrator.useAutomaticStepControl(30);
+    for (int k = 0; k < 2; k++)
+        integrator.setReferenceMonitorValue(1e20, k);
+    Context context(system, integrator, getTestPlatform());
+    context.setPositions(positions);
+    for (int attempt = 0; attempt < 2; attempt++) {
+        assertThrows("the particles have become faster than light", [&] { integrator.step(50); });
+        ASSERT_EQUAL(4, context.getStepCount());
+        ASSERT_EQUAL_TOL(4 * size, context.getTime(), 1e-12);
+        const State state = context.getState(State::Velocities);
+        for (const Vec3& v : state.getVelocities())
+            ASSERT_EQUAL_TOL(8.8e5, v[0], 1e-5);
+    }
+    context.setPositions(positions);
+    context.setVelocities(vector<Vec3>(3));
+    integrator.step(4);
+    ASSERT_EQUAL(8, context.getStepCount());
+}
+
 // A first step that is taken twice fails in either pass; whatever is chosen then, the density does not oscillate.
 inline void testDensityAfterFailedFirstStep() {
     for (const int evaluation : {2, 3})
@@ -390,6 +424,7 @@ inline TestList getFailureTests() {
     return {
         {"forces that fail", testForcesThatFail},
         {"steps that are too large", testStepsThatAreTooLarge},
+        {"faster than light", testFasterThanLight},
         {"the density after a failed first step", testDensityAfterFailedFirstStep},
         {"times of forces", testTimesOfForces},
         {"a force that depends on time", testForceThatDependsOnTime},

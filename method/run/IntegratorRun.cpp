@@ -232,6 +232,8 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
                      settings.langevin
                          ? "; the Context is in the state before this step: move apart what overlaps, or allow more "
                            "substeps with setMaximumSubsteps()"
+                     : settings.isAutomatic
+                         ? "; the Context is in the state before this step: use a smaller step size"
                          : "; the Context is in the state before this step: use a smaller step size, or "
                            "another monitor");
     }

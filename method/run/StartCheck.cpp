@@ -5,6 +5,7 @@
 #include "constraints/StepFailure.h"
 #include "openmm/Force.h"
 #include "openmm/OpenMMException.h"
+#include "step/AutomaticControl.h"
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -17,8 +18,6 @@ using std::vector;
 
 namespace {
 
-// Three times the speed of light, in nm/ps.
-const double MAX_SPEED = 1e6;
 // A constrained distance counts as met to this fraction, which is more than bonds vibrate by, and no worse than to this
 // distance (nm): the longer a constraint is, the sooner some image of a start that is far off would meet it by chance.
 const double MET_FRACTION = 0.1, MET_DISTANCE = 0.03;
@@ -73,7 +72,7 @@ void requireVelocities(const ConstraintSystem& system, const StartState& state) 
         if (!isFinite(state.velocities[i]))
             throw StepFailure(particle + " is not a finite number" + VELOCITIES_HINT);
         const double speed = lengthOf(state.velocities[i]);
-        if (speed > MAX_SPEED) {
+        if (speed > IMPOSSIBLE_SPEED) {
             std::stringstream reason;
             reason << particle << " is " << speed << " nm/ps, faster than light" << VELOCITIES_HINT;
             throw StepFailure(reason.str());

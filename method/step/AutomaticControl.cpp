@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "step/AutomaticControl.h"
+#include <sstream>
 #include <string>
 
 using namespace OpenMMVRattle;
@@ -35,6 +36,10 @@ AutomaticControl::AutomaticControl(ConstraintSolver& solver) :
     numDegreesOfFreedom = std::max(1.0, 3.0 * (double) solver.getMovingParticles().size() - system.getNumConstraints());
     for (vector<double>* numbers : {&memory.forceSquares, &measuredSquares, &scratch})
         numbers->resize(numClusters);
+    double mass = 0;
+    for (int i : solver.getMovingParticles())
+        mass += system.getMasses()[i];
+    choice.hottest = mass * IMPOSSIBLE_SPEED * IMPOSSIBLE_SPEED / numDegreesOfFreedom;
 }
 
 void AutomaticControl::setSettings(const Settings& settings) {
@@ -86,8 +91,21 @@ void AutomaticControl::begin(const State& state) {
     memory.values[HalfStep] = 0;
 }
 
+// A run far beyond the limit of stability gains energy in each step, and goes on with all steps at their minimum.
+void AutomaticControl::requirePossibleSpeeds() const {
+    if (temperature <= choice.hottest)
+        return;
+    std::stringstream reason;
+    reason
+        << "the particles have become faster than light (2K/f is " << temperature
+        << " kJ/mol): steps of the nominal size are beyond the limit of stability, and there is nothing left to go on "
+           "from";
+    throw StepFailure(reason.str());
+}
+
 void AutomaticControl::measure(const State& state, const vector<Vec3>& w, double size, const vector<Vec3>& oldForce) {
     findSquares(state, measuredSquares);
+    requirePossibleSpeeds();
     measured[OnStep] = evaluateOnStep(state, measuredSquares);
     requireFinite(measured[OnStep], "U_A");
     clusterForces.sumOverClusters([&](int i) { return w[i].dot(state.forces[i] - oldForce[i]); }, scratch);

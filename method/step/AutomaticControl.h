@@ -32,6 +32,9 @@ inline wide unstretch(wide y, wide a) {
 #undef DEVICE
 } // namespace AutomaticRecursions
 
+/** Three times the speed of light (nm/ps). */
+const double IMPOSSIBLE_SPEED = 1e6;
+
 /**
  * Automatic step control: the density rho from two monitors that need no choice (docs/automatic_method.md has the reasons).
  *
@@ -164,6 +167,7 @@ public:
 
 private:
     void findSquares(const State& state, std::vector<double>& squares);
+    void requirePossibleSpeeds() const;
     double evaluateOnStep(const State& state, const std::vector<double>& squares);
 
     ConstraintSolver& solver;

@@ -30,6 +30,7 @@ typedef struct {
     wide learningSteps; // how many steps the references are the mean of
     wide given[2]; // references that are not to be found; 0 for the others
     wide thermalUnit; // (sum_c max(1, N_c/12)^4)^(1/8)/stepSize with the number N_c of particles in a cluster
+    wide hottest; // 2K/f (kJ/mol) beyond which nothing moves any more as a particle can
 } AutomaticChoice;
 
 /** The value of a monitor where the momenta of every cluster change by those of this 2K/f in a nominal step. */

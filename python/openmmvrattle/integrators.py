@@ -1146,8 +1146,9 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         self._has_warned = True
         warnings.warn(
             f"VariableStepRattleIntegrator: automatic step control has taken {_MANY_SHORT_STEPS} steps in a row that "
-            f"are shorter than a tenth of the nominal step size; if nothing is that hard here, find new reference "
-            f"values with useAutomaticStepControl(), or bound the steps with setMinimumStepSize()",
+            f"are shorter than a tenth of the nominal step size; look whether the total energy has risen, as it does "
+            f"with a nominal step that is too large for the System; if not, and nothing is that hard here, find new "
+            f"reference values with useAutomaticStepControl(), or bound the steps with setMinimumStepSize()",
             stacklevel=3,
         )
 

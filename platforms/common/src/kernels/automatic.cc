@@ -149,12 +149,6 @@ inline DEVICE void addClustersOfPieces(int numPartials, GLOBAL const mixed* REST
 
 // ------------------------------------------------------------------------------------- the numbers in the control block
 
-/** Whether the monitors are numbers. */
-inline DEVICE bool areMonitorsValid(const mixed* sums) {
-    const wide largest = (wide) 1e30f;
-    return eighthRoot(sums[SUM_ON_STEP]) < largest && eighthRoot(sums[SUM_HALF_STEP]) < largest && sums[SUM_KINETIC] < largest;
-}
-
 inline DEVICE AutomaticChoice loadChoice(GLOBAL const wide* RESTRICT settings) {
     AutomaticChoice choice;
     UNROLL for (int i = 0; i < NUM_CHOICES; i++)
@@ -162,12 +156,24 @@ inline DEVICE AutomaticChoice loadChoice(GLOBAL const wide* RESTRICT settings) {
     return choice;
 }
 
+inline DEVICE wide temperatureOf(const mixed* sums, GLOBAL const wide* RESTRICT settings) {
+    return (wide) sums[SUM_KINETIC]*settings[FIRST_TERM + NUM_CHOICES];
+}
+
+/** Whether the monitors are numbers, and particles as fast as they can be. */
+inline DEVICE bool areMonitorsValid(const mixed* sums, GLOBAL const wide* RESTRICT settings) {
+    const wide largest = (wide) 1e30f;
+    const AutomaticChoice choice = loadChoice(settings);
+    return eighthRoot(sums[SUM_ON_STEP]) < largest && eighthRoot(sums[SUM_HALF_STEP]) < largest &&
+           temperatureOf(sums, settings) <= choice.hottest;
+}
+
 /** Take over the end of the last step, if that has not been done. */
 inline DEVICE void acceptAutomaticStep(const mixed* sums, wide* now, GLOBAL const wide* RESTRICT settings) {
     if (now[IS_ACCEPTED] != 0)
         return;
     const AutomaticChoice choice = loadChoice(settings);
-    const wide kT = (wide) sums[SUM_KINETIC]*settings[FIRST_TERM + NUM_CHOICES];
+    const wide kT = temperatureOf(sums, settings);
     wide* references = now + FIRST_REFERENCE;
     AutomaticNumbers numbers;
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)
@@ -190,7 +196,7 @@ inline DEVICE void acceptAutomaticStep(const mixed* sums, wide* now, GLOBAL cons
 /** Go on after others have changed the state. */
 inline DEVICE void changeAutomaticState(const mixed* sums, int change, wide* now, GLOBAL const wide* RESTRICT settings) {
     const AutomaticChoice choice = loadChoice(settings);
-    const wide kT = (wide) sums[SUM_KINETIC]*settings[FIRST_TERM + NUM_CHOICES];
+    const wide kT = temperatureOf(sums, settings);
     const wide part = (change == ALL_CHANGED ? (wide) 1 : min((wide) 1, sqrt((wide) sums[SUM_CHANGE]/max((wide) sums[SUM_SCALE], (wide) 1e-30f))));
     AutomaticNumbers numbers;
     UNROLL for (int i = 0; i < NUM_NUMBERS; i++)
@@ -211,7 +217,7 @@ inline DEVICE wide nextAutomaticDensity(const wide* now, GLOBAL const wide* REST
 
 /** For evaluateState; false if a monitor is no number. */
 inline DEVICE bool evaluateAutomaticState(const mixed* sums, int change, GLOBAL wide* RESTRICT control, GLOBAL const wide* RESTRICT settings) {
-    if (!areMonitorsValid(sums))
+    if (!areMonitorsValid(sums, settings))
         return false;
     wide now[CONTROL_SIZE];
     for (int i = 0; i < CONTROL_SIZE; i++)

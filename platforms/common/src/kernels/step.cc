@@ -566,7 +566,7 @@ KERNEL void advanceStep(int step, wide groupEnergy, wide maxStep, mixed toleranc
         now[MISMATCH_SLOPE] = trial[TRIAL_SLOPE];
         now[MOST_TRIALS] = max(now[MOST_TRIALS], trial[TRIAL_COUNT]);
 #elif UPDATE == AUTOMATIC
-        const wide u = (areMonitorsValid(sums) ? (wide) 1 : (wide) -1);
+        const wide u = (areMonitorsValid(sums, settings) ? (wide) 1 : (wide) -1);
         const bool isSolved = true;
         acceptAutomaticStep(sums, now, settings);
         wide rho = nextAutomaticDensity(now, settings);
