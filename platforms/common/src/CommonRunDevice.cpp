@@ -523,16 +523,22 @@ template <class Method> vector<double> CommonRunDevice<Method>::getMonitorValues
     return lastReport.values;
 }
 
+// Whether the GPU alone has the numbers of the state, all of them.
+template <class Method> bool CommonRunDevice<Method>::areNumbersOnDevice() {
+    settle();
+    return isOnDevice && hasBegun && !isOnHost;
+}
+
 template <class Method> vector<double> CommonRunDevice<Method>::getMultipliers() {
+    if (areNumbersOnDevice())
+        return steps->getMultipliers();
     bringToHost();
     return Host::getMultipliers();
 }
 
 // Which a run that pulls asks for in each step.
 template <class Method> double CommonRunDevice<Method>::getExpressionMultiplier(int index) {
-    settle();
-    const bool isOthers = isOnDevice && hasBegun && !isOnHost;
-    return isOthers ? steps->getExpressionMultipliers()[index] : Host::getExpressionMultiplier(index);
+    return areNumbersOnDevice() ? steps->getExpressionMultipliers()[index] : Host::getExpressionMultiplier(index);
 }
 
 template <class Method> double CommonRunDevice<Method>::computeKineticEnergy() {
@@ -564,7 +570,12 @@ template <class Method> const DeviceSteps::State* CommonRunDevice<Method>::findD
     return isOnHost ? nullptr : &state;
 }
 
+// What others have made of the Context since the last step is taken note of first: it is all there is to save, and the density belongs
+// to the state before.
 template <class Method> void CommonRunDevice<Method>::save(RunState& run) {
+    settle();
+    if (isOnDevice && !isOnHost && vectors->getStepCount() != knownCount)
+        changeState();
     bringToHost();
     Host::save(run);
 }

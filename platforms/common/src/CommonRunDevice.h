@@ -102,6 +102,7 @@ protected:
 
 private:
     bool canStepOnDevice();
+    bool areNumbersOnDevice();
     void correctMasses();
     bool areForcesValid();
     void ensureForces();

@@ -96,13 +96,16 @@ void DeviceSteps::initialize() {
     // An array has at least one element.
     vector<int> atomData;
     vector<double> lengthData;
+    smallConstraints.clear();
     for (const ClusterKind* kind : StepProgram::findSmallKinds(layout)) {
         for (int i = 0; i < kind->numParticles; i++)
             for (int cluster = 0; cluster < kind->getNumClusters(); cluster++)
                 atomData.push_back(kind->getParticle(cluster, i));
         for (int k = 0; k < kind->getNumConstraints(); k++)
-            for (int cluster = 0; cluster < kind->getNumClusters(); cluster++)
-                lengthData.push_back(layout.distances[kind->getConstraint(cluster, k)].length);
+            for (int cluster = 0; cluster < kind->getNumClusters(); cluster++) {
+                smallConstraints.push_back(kind->getConstraint(cluster, k));
+                lengthData.push_back(layout.distances[smallConstraints.back()].length);
+            }
     }
     atomData.resize(std::max<size_t>(1, atomData.size()));
     lengthData.resize(std::max<size_t>(1, lengthData.size()));
@@ -508,6 +511,25 @@ void DeviceSteps::moveParameters(const vector<ExpressionConstraint>& given) {
 ExpressionParameters DeviceSteps::getParameters() {
     OpenMM::ContextSelector selector(context);
     return expressions ? expressions->getParameters(stepSizeRead) : ExpressionParameters();
+}
+
+vector<double> DeviceSteps::getMultipliers() {
+    OpenMM::ContextSelector selector(context);
+    const int numDistances = (int) layout.distances.size();
+    vector<double> result(numDistances + (expressions ? expressions->getClusters().getRows().size() : 0));
+    auto take = [&](OpenMM::ComputeArray& array, const vector<int>& constraints) {
+        if (constraints.empty())
+            return;
+        vector<double> found;
+        array.download(found, true);
+        for (size_t i = 0; i < constraints.size(); i++)
+            result[constraints[i]] = found[i] * (constraints[i] < numDistances ? 0.5 : 1.0);
+    };
+    take(multipliers, smallConstraints);
+    take(largeMultipliers, large.getConstraints());
+    if (expressions)
+        take(expressions->getMultiplierArray(), expressions->getClusters().getConstraints());
+    return result;
 }
 
 vector<double> DeviceSteps::getExpressionMultipliers() {

@@ -124,7 +124,12 @@ public:
     bool prepareNewton();
     /** Put back the state before the last step, whose finish() is not to come, or before an earlier one that has failed; as read(). */
     Report putBack();
-    /** Lambda(q[n],p[n]) of the expressions, all that were given, where the steps have led that were read last. Waits for the device. */
+    /**
+     * Lambda(q[n],p[n]) where the steps have led that were read last, of all constraints in the order in which they were given: that
+     * of a distance is the one of |r|^2 - L^2. Waits for the device, once for each of the sorts of clusters that there are.
+     */
+    std::vector<double> getMultipliers();
+    /** The same of the expressions alone. */
     std::vector<double> getExpressionMultipliers();
     /** Whether a step has failed. Waits for the device. */
     bool hasFailed();
@@ -197,6 +202,7 @@ private:
     int numFused; // pieces among the work groups of the small clusters
     unsigned numLargeLaunches;
     long long numLaunches;
+    std::vector<int> smallConstraints; // as they were given, in the order of lengths and multipliers
     int half; // the control block that is in force
     int stepNumber; // of the last advance()
     int numTrials; // launches for a density

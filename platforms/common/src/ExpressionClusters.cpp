@@ -62,6 +62,7 @@ const char DISTANCE_EXPRESSION[] = "0.5*((x1-x2)^2 + (y1-y2)^2 + (z1-z2)^2 - len
 struct ExpressionClusters::Row {
     int kind, firstParameter, expression; // the last is NONE for a distance
     vector<int> particles;
+    int constraint = NONE; // as it was given
 };
 
 // Clusters one after the other, each in its own order of elimination.
@@ -95,12 +96,13 @@ ExpressionClusters::ExpressionClusters(const ClusterLayout& layout, const vector
     auto makeRow = [&](int k) {
         const int e = k - numDistances;
         if (e >= 0)
-            return Row{kindsOfExpressions[e], firstParameters[e], e, expressions[e].particles};
+            return Row{kindsOfExpressions[e], firstParameters[e], e, expressions[e].particles, k};
         parameters.push_back(layout.distances[k].length);
         return Row{DISTANCE,
                    (int) parameters.size() - 1,
                    NONE,
-                   {layout.distances[k].particle1, layout.distances[k].particle2}};
+                   {layout.distances[k].particle1, layout.distances[k].particle2},
+                   k};
     };
     std::map<int, ClusterElimination> eliminations; // of each kind
     Part open;
@@ -253,6 +255,7 @@ void ExpressionClusters::addPart(const Part& part, const vector<double>& inverse
         kindOfRow.push_back(row.kind);
         rowParameter.push_back(row.firstParameter);
         rowEntry.push_back((int) entryPlaces.size());
+        constraints.push_back(row.constraint);
         if (row.expression != NONE)
             rowOfExpression[row.expression] = numConstraints + place;
         for (int i : row.particles) {

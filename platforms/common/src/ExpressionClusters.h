@@ -75,6 +75,10 @@ public:
     const std::vector<int>& getRows() const {
         return rowOfExpression;
     }
+    /** Of each row of all parts: its constraint, as it was given. */
+    const std::vector<int>& getConstraints() const {
+        return constraints;
+    }
     /** Numbers that the parts work with. */
     size_t getNumWork() const {
         return numWork;
@@ -99,7 +103,7 @@ private:
     std::map<Kind, int> numberOfKind;
     std::vector<int> parts, tables, places;
     std::vector<int> firstParameters, rowOfExpression; // of each expression
-    std::vector<int> givenParameters;
+    std::vector<int> givenParameters, constraints;
     std::vector<double> parameters;
     int numParameters, numConstraints, numLevels;
     size_t numWork, numFactorEntries;

@@ -30,6 +30,10 @@ public:
     };
     ExpressionSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout,
                     const std::vector<ExpressionConstraint>& expressions);
+    /** Lambda of all rows of all parts. */
+    OpenMM::ComputeArray& getMultiplierArray() {
+        return multipliers;
+    }
     const ExpressionClusters& getClusters() const {
         return clusters;
     }

@@ -292,6 +292,7 @@ void LargeClusters::clear() {
     rowLengths.clear();
     jointLengths.clear();
     atoms.clear();
+    constraints.clear();
     numConstraints = localSize = numLevels = numJoints = numJointLevels = 0;
     numFactors = numWork = numWords = numEntries = 0;
 }
@@ -535,6 +536,8 @@ bool LargeClusters::addKind(const ClusterLayout& given, const ClusterKind& kind,
                 atoms.push_back(kind.getParticle(c, i));
             pieces.push_back(piece);
         }
+        for (int k = 0; k < count; k++)
+            constraints.push_back(kind.getConstraint(c, k));
         numConstraints += count;
     }
     return true;

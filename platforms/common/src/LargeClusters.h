@@ -82,6 +82,10 @@ public:
     int getNumConstraints() const {
         return numConstraints;
     }
+    /** Of each number of a constraint: as it was given. */
+    const std::vector<int>& getConstraints() const {
+        return constraints;
+    }
     /** Numbers in global memory: of the factors, of what else a piece has, and words of 64 bits for what is sent. */
     size_t getNumFactors() const {
         return numFactors;
@@ -133,7 +137,7 @@ private:
     std::vector<unsigned> tables;
     std::vector<Row> rows, joints;
     std::vector<double> rowLengths, jointLengths;
-    std::vector<int> atoms;
+    std::vector<int> atoms, constraints;
     int numConstraints, numThreads, narrow, localMemory, localSize, numLevels, numJoints, numJointLevels;
     size_t numFactors, numWork, numWords, numEntries;
 };

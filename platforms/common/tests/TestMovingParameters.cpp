@@ -5,6 +5,7 @@
 
 #include "TestMovingParameters.h"
 #include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
+#include <algorithm>
 
 using namespace OpenMMVRattle;
 
@@ -233,6 +234,7 @@ void testReversal() {
 void testMessages() {
     for (const auto& choice : allChoices()) {
         std::string messages[2];
+        vector<double> after[2];
         for (int k = 0; k < 2; k++) {
             MovingRun run(choice.second, k == 0 ? Platform::getPlatform("Reference") : getTestPlatform());
             for (int i = 0; i < 5; i++) {
@@ -251,9 +253,39 @@ void testMessages() {
             run.moveConstraint();
             run.integrator.step(1);
             ASSERT(k == 0 || run.integrator.isOnDevice());
+            // The jump that was not made leaves nothing behind, wherever the next begin.
+            for (int i = 0; i < 5; i++) {
+                run.moveConstraint();
+                run.integrator.step(1);
+            }
+            after[k] = run.trace().numbers;
         }
+        ASSERT_EQUAL(after[0].size(), after[1].size());
+        for (size_t i = 0; i < after[0].size(); i++)
+            ASSERT_EQUAL_TOL(after[0][i], after[1][i], 1e-7);
         ASSERT(messages[0].find("move them by less at a time") != std::string::npos);
         ASSERT_EQUAL(withoutNumbers(messages[0]), withoutNumbers(messages[1]));
+    }
+}
+
+// Context::reinitialize() in the midst of a motion.
+void testReinitialize() {
+    const auto choices = choicesOfPivot();
+    for (const std::string name : {"SemiExplicit", "automatic"}) {
+        const auto choice =
+            std::find_if(choices.begin(), choices.end(), [&](const auto& c) { return c.first == name; });
+        PivotRun here(choice->second, getTestPlatform()), there(choice->second, Platform::getPlatform("Reference"));
+        for (PivotRun* each : {&here, &there}) {
+            for (int i = 0; i < 20; i++) {
+                if (i == 10)
+                    each->context->reinitialize(true);
+                each->step({{"py", -0.004}, {"r", 1e-4}});
+            }
+            ASSERT_EQUAL(each == &here, each->integrator.isOnDevice());
+        }
+        requireAtMost(1e-8, largestDifference(here.positions(), there.positions()), name);
+        ASSERT_EQUAL_TOL(there.integrator.getStepDensity(), here.integrator.getStepDensity(), 1e-7);
+        ASSERT_EQUAL_TOL(there.integrator.getMultipliers()[0], here.integrator.getMultipliers()[0], 1e-7);
     }
 }
 
@@ -266,5 +298,6 @@ int main(int argc, char** argv) {
     tests.push_back({"Langevin dynamics", testLangevin});
     tests.push_back({"reversal while moving", testReversal});
     tests.push_back({"what is said of a failure", testMessages});
+    tests.push_back({"reinitialize while moving", testReinitialize});
     return runOnPlatform(tests, argc, argv);
 }

@@ -261,6 +261,52 @@ void testAutomaticControl() {
     ASSERT_EQUAL(found[0].downloads, found[1].downloads);
 }
 
+// What a reporter asks for after a step brings from the device what it returns, once, and nothing of the particles.
+void testGetters() {
+    const int count = 20;
+    const Dumbbells t(count);
+    const auto require = [](const std::string& name, int downloads, size_t bytes, const std::function<void()>& get) {
+        const Calls found = callsOf(get);
+        if (found.downloads != downloads || found.bytes > bytes || found.uploads != 0)
+            throw OpenMMException(name + " takes " + std::to_string(found.downloads) + " downloads and " +
+                                  std::to_string(found.bytes) + " bytes");
+    };
+    for (const bool isAutomatic : {false, true}) {
+        Integrator_ integrator(0.001);
+        if (isAutomatic)
+            integrator.useAutomaticStepControl(3);
+        Context context(t.system, integrator, getTestPlatform());
+        t.begin(context);
+        integrator.step(5);
+        for (int i = 0; i < 2; i++) { // what has been asked for once may be known
+            integrator.step(5);
+            ASSERT(integrator.isOnDevice());
+            require("getMultipliers()", 1, 8 * count, [&] { integrator.getMultipliers(); });
+            require("getMonitorValue()", 0, 0, [&] { integrator.getMonitorValue(); });
+            require("getReferenceMonitorValue()", 0, 0, [&] { integrator.getReferenceMonitorValue(); });
+            require("getStepSize()", 0, 0, [&] { integrator.getStepSize(); });
+            require("getStepDensity()", 0, 0, [&] { integrator.getStepDensity(); });
+            require("getTime()", 0, 0, [&] { context.getTime(); });
+            require("getStepCount()", 0, 0, [&] { context.getStepCount(); });
+            require("getNumForceEvaluations()", 0, 0, [&] { integrator.getNumForceEvaluations(); });
+            require("getNumSolverIterations()", 1, 1024, [&] { integrator.getNumSolverIterations(); });
+            require("getNumRescues()", 0, 0, [&] { integrator.getNumRescues(); });
+            require("getNumShortSteps()", 0, 0, [&] { integrator.getNumShortSteps(); });
+        }
+    }
+    VariableStepRattleLangevinIntegrator langevin(300, 1, 0.002);
+    Context context(t.system, langevin, getTestPlatform());
+    t.begin(context);
+    langevin.step(10);
+    ASSERT(langevin.isOnDevice());
+    require("getMultipliers()", 1, 8 * count, [&] { langevin.getMultipliers(); });
+    require("getReferenceMonitorValue()", 0, 0, [&] { langevin.getReferenceMonitorValue(); });
+    require("getNumForceEvaluations()", 0, 0, [&] { langevin.getNumForceEvaluations(); });
+    require("getNumSolverIterations()", 1, 1024, [&] { langevin.getNumSolverIterations(); });
+    require("getNumSubstepped()", 0, 0, [&] { langevin.getNumSubstepped(); });
+    require("getLargestSubsteps()", 0, 0, [&] { langevin.getLargestSubsteps(); });
+}
+
 } // namespace
 
 int main(int argc, char** argv) {
@@ -268,6 +314,7 @@ int main(int argc, char** argv) {
                           {"waits of OpenMM's own", testOpenMM},
                           {"waits with a barostat", testBarostat},
                           {"traffic of a constraint that moves", testTraffic},
-                          {"automatic step control", testAutomaticControl}},
+                          {"automatic step control", testAutomaticControl},
+                          {"what reporters ask for", testGetters}},
                          argc, argv);
 }
