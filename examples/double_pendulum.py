@@ -205,7 +205,7 @@ def run_trial(method: Method, time: float, masses: tuple[float, float] = (1.0, 1
     """Run a method, and then RATTLE with its average step, as the paper does."""
     variable = run_pendulum(method.control, time, masses, record_positions=method is U2)
     average = float(variable.series.times[-1]) / variable.steps
-    fixed = run_pendulum(StepControl((), average), time, masses, variable.steps, record_multipliers=True)
+    fixed = run_pendulum(StepControl((), average), time, masses, variable.steps, record_multipliers=method is U1)
     return Trial(masses, method, variable, fixed)
 
 

@@ -18,13 +18,14 @@ from __future__ import annotations
 import argparse
 import bisect
 import csv
+import functools
 import json
 import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import openmm
@@ -139,19 +140,60 @@ class Run:
         return float(np.sqrt(np.sum(np.diff(times) * errors[1:] ** 2) / TIME))
 
 
+class OpenContext:
+    """A Context of a rod with a step control, in which one run follows the other, each as if it were new.
+
+    The runs here are many and short, and a GPU takes longer to compile for a Context than for the steps of a run.
+    """
+
+    kept: ClassVar[dict[Any, OpenContext]] = {}
+
+    def __init__(self, rod: TestSystem, control: StepControl) -> None:
+        self.rod, self.integrator = rod, make_integrator(control)
+        rod.prepare(self.integrator)
+        self.context = make_context(rod.system, self.integrator, platform)
+        self.context.setPositions(rod.positions)
+        self.fresh = self.context.createCheckpoint()
+
+    @classmethod
+    def of(cls, rod: TestSystem, control: StepControl) -> OpenContext:
+        """One for this control, whatever its nominal step, in the state in which a run begins."""
+        key = (id(rod.system), replace(control, nominal_step_size=1.0), platform)
+        if key not in cls.kept:
+            cls.kept[key] = cls(rod, control)
+        here = cls.kept[key]
+        here.context.loadCheckpoint(here.fresh)
+        nominal = control.nominal_step_size
+        here.integrator.setStepSize(nominal)
+        here.integrator.setMinimumStepSize(control.smallest_step_ratio * nominal)
+        here.integrator.setMaximumStepSize(control.largest_step_ratio * nominal)
+        return here
+
+
+@functools.cache
+def rod_with(form: str) -> TestSystem:
+    """The rod of the paper, whose force group states the nearness of the wall in this form, see `elastic_rod`."""
+    return elastic_rod(monitor=form)
+
+
 class Recorder:
     """A rod in a Context, and what is seen of it after each step."""
 
-    def __init__(self, rod: TestSystem, integrator: Any, start: float = 0.0) -> None:
-        self.rod, self.integrator = rod, integrator
-        rod.prepare(integrator)
-        self.context = make_context(rod.system, integrator, platform)
+    def __init__(self, rod: TestSystem, control: StepControl, start: float = 0.0) -> None:
+        here = OpenContext.of(rod, control)
+        self.rod, self.integrator, self.context = rod, here.integrator, here.context
+        self.counts = self.count()
         self.context.setPositions(rod.positions)
         self.context.setVelocities(rod.velocities)
         self.times, self.energies, self.sizes = [start], [], [math.nan]
         self.densities: list[float] = []
         self.positions: list[np.ndarray] = []
         self.look()
+
+    def count(self) -> np.ndarray:
+        """Force evaluations, solver iterations and rescues in this Context."""
+        i = self.integrator
+        return np.array([i.getNumForceEvaluations(), i.getNumSolverIterations(), i.getNumRescues()])
 
     def look(self) -> None:
         """Record energy and positions."""
@@ -171,11 +213,12 @@ class Recorder:
     def finish(self, first_step: float, scale: float = 1.0, failure: str | None = None) -> Run:
         """The run so far; the densities are multiplied by scale."""
         positions = np.array(self.positions)
+        force_evaluations, solver_iterations, rescues = (int(each) for each in self.count() - self.counts)
         return Run(
             first_step=first_step,
-            force_evaluations=int(self.integrator.getNumForceEvaluations()),
-            solver_iterations=int(self.integrator.getNumSolverIterations()),
-            rescues=int(self.integrator.getNumRescues()),
+            force_evaluations=force_evaluations,
+            solver_iterations=solver_iterations,
+            rescues=rescues,
             initial_energy=self.energies[0],
             series=Series(np.array(self.times), np.array(self.energies) - self.energies[0], np.array(self.sizes)),
             densities=np.array(self.densities) * scale,
@@ -209,10 +252,10 @@ def run_rod(
         rod: the rod and its state at the start; by default the one of the paper.
         start: the time of that state in ps.
     """
-    rod = rod or elastic_rod(monitor=method.form)
+    rod = rod or rod_with(method.form)
     if method.has_simple_start:
         return run_with_density(first_step, difficulty(rod), rod, start)
-    recorder = Recorder(rod, make_integrator(method.control(first_step)), start)
+    recorder = Recorder(rod, method.control(first_step), start)
     end = TIME * (1.0 - 1e-9)  # a sum of many steps is rounded
     failure = None
     try:
@@ -245,7 +288,7 @@ def run_with_density(first_step: float, before: float, rod: TestSystem, start: f
         rod: the rod and its state at the start.
         start: the time of that state in ps.
     """
-    recorder = Recorder(rod, make_integrator(RATTLE.control(first_step)), start)
+    recorder = Recorder(rod, RATTLE.control(first_step), start)
     constant = first_step * difficulty(rod)
     density, failure = before, None
     try:
@@ -261,15 +304,15 @@ def run_with_density(first_step: float, before: float, rod: TestSystem, start: f
 def density_one_step_back(first_step: float, rod: TestSystem) -> float:
     """The paper's value of rho[-1/2]: the mean of U3 at the start and one step of RATTLE back in time."""
     backwards = replace(rod, velocities=-rod.velocities)
-    recorder = Recorder(backwards, make_integrator(RATTLE.control(first_step)))
+    recorder = Recorder(backwards, RATTLE.control(first_step))
     recorder.step()
     return float(np.mean(nearness(np.array(recorder.positions)) ** EXPONENT))
 
 
 def rod_on_its_way() -> TestSystem:
     """The rod at the later start, by small fixed steps."""
-    rod = elastic_rod(monitor="maximum")
-    recorder = Recorder(rod, make_integrator(RATTLE.control(2e-4)))
+    rod = rod_with("maximum")
+    recorder = Recorder(rod, RATTLE.control(2e-4))
     recorder.integrator.stepTo(LATER_START)
     state = recorder.context.getState(positions=True, velocities=True)
     positions, velocities = state.getPositions(asNumpy=True)._value, state.getVelocities(asNumpy=True)._value
@@ -392,7 +435,7 @@ def run_study(steps: Sequence[int] = STEPS, progress: Progress | None = None) ->
         trials[method.name] = run_trials(method, steps)
     report("three starts")
     first_step = FIRST_STEPS[0]
-    beginning = elastic_rod(monitor="maximum")
+    beginning = rod_with("maximum")
     starts = {
         start: run_starts(first_step, rod, start) for start, rod in ((0.0, beginning), (LATER_START, rod_on_its_way()))
     }
