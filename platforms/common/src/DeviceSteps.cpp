@@ -593,6 +593,11 @@ void DeviceSteps::change(double energy, Control::Change change) {
     groupEnergy = energy;
     launchFinish(stepNumber + 1, 0, change, true);
     launchEvaluate(stepNumber + 1, change, false);
+    if (!program->hasHalfSums() || change == Control::VelocitiesChanged)
+        return;
+    // At other positions or forces p[n-1/2] is formed anew, with the density that is known by now.
+    launchFinish(stepNumber + 1, 0, change, true);
+    launchEvaluate(stepNumber + 1, Control::NothingChanged, false);
 }
 
 vector<double> DeviceSteps::readReport() {

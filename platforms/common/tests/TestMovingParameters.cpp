@@ -269,7 +269,7 @@ void testMessages() {
 }
 
 // Context::reinitialize() in the midst of a motion.
-void testReinitialize() {
+void testReinitializeWhileMoving() {
     const auto choices = choicesOfPivot();
     for (const std::string name : {"SemiExplicit", "automatic"}) {
         const auto choice =
@@ -298,6 +298,6 @@ int main(int argc, char** argv) {
     tests.push_back({"Langevin dynamics", testLangevin});
     tests.push_back({"reversal while moving", testReversal});
     tests.push_back({"what is said of a failure", testMessages});
-    tests.push_back({"reinitialize while moving", testReinitialize});
+    tests.push_back({"reinitialize while moving", testReinitializeWhileMoving});
     return runOnPlatform(tests, argc, argv);
 }

@@ -885,7 +885,7 @@ void testChangedVelocities() {
         both.stepOnHost();
         both.context.setPositions(positions);
         both.context.setVelocities(after);
-        // The device forms the half-step momentum anew, with the scaled density; the host changes its own.
+        // The device forms the half-step momentum anew; the host changes its own.
         both.requireAgreement(report, 1e-6, 1e-4, 1e-4);
     }
 }
