@@ -13,7 +13,7 @@ import pytest
 from openmm import unit
 from openmmvrattle import VariableStepRattleIntegrator
 from openmmvrattle.platforms import make_context
-from openmmvrattle.testsystems import constraint_error, project_onto_constraints
+from openmmvrattle.testsystems import constraint_error, project_onto_constraints, rigid_waters
 from run_support import GPU, needs_gpu
 
 pytestmark = needs_gpu
@@ -128,6 +128,29 @@ def turning_zigzag(platform: str, steps_at_once: int) -> tuple[np.ndarray, list[
         are_on_device.append(integrator.isOnDevice())
     assert context.getStepCount() == 4
     return context.getState(positions=True).getPositions(asNumpy=True)._value, are_on_device
+
+
+@pytest.mark.skipif(GPU != "OpenCL", reason="with others it has not been tried")
+def test_several_devices() -> None:
+    """Two that share the forces, here one taken twice: the steps are the first one's, and the run is the same."""
+    waters = rigid_waters()
+    positions, densities = [], []
+    for devices in ("0", "0,0"):
+        integrator = VariableStepRattleIntegrator(0.001)
+        properties = {"Precision": "double", "DeviceIndex": devices}
+        context = openmm.Context(waters.system, integrator, openmm.Platform.getPlatform(GPU), properties)
+        assert context.getPlatform().getPropertyValue(context, "DeviceIndex") == devices
+        context.setPositions(waters.positions)
+        context.setVelocities(waters.velocities)
+        integrator.step(20)
+        context.loadCheckpoint(context.createCheckpoint())
+        integrator.step(10)
+        assert integrator.isOnDevice()
+        positions.append(context.getState(positions=True).getPositions(asNumpy=True)._value)
+        densities.append(integrator.getStepDensity())
+    assert np.max(np.abs(positions[0] - positions[1])) < 1e-9
+    assert densities[0] == pytest.approx(densities[1], rel=1e-9)
+    assert abs(densities[0] - 1) > 0.01
 
 
 @pytest.mark.parametrize("steps_at_once", [1, 4])
