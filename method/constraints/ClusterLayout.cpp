@@ -310,6 +310,11 @@ vector<int> LayoutBuilder::walkThroughConstraints(const vector<int>& cluster,
 
 } // namespace
 
+ClusterElimination ClusterKind::eliminateInRounds(int pieceSize) const {
+    const ClusterCut cut = pieceSize == WHOLE ? leaveWhole(particlesOf) : cutClusterAlongTree(particlesOf, pieceSize);
+    return ClusterElimination(particlesOf, cut, ClusterElimination::FewLevels);
+}
+
 ClusterLayout::ClusterLayout(const vector<double>& masses, const vector<DistanceConstraint>& givenDistances,
                              const vector<ExpressionConstraint>& expressions) : distances(givenDistances) {
     for (double mass : masses)

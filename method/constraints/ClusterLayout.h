@@ -26,6 +26,12 @@ struct ClusterKind {
     std::vector<int> particles;   // of all clusters, one after the other: in the order of their first particles
     std::vector<int> constraints; // likewise
     ClusterElimination elimination; // for a processor that does one thing after the other
+    /**
+     * The elimination for a processor that does much at once: in few levels, and in pieces of about so many particles, or whole. A
+     * device asks for it once, with a size that suits it.
+     */
+    ClusterElimination eliminateInRounds(int pieceSize = WHOLE) const;
+    static constexpr int WHOLE = 0;
     int getNumConstraints() const {
         return (int) particlesOf.size();
     }

@@ -4,8 +4,9 @@
 #ifndef OPENMMVRATTLE_EXAMPLES_H_
 #define OPENMMVRATTLE_EXAMPLES_H_
 
-#include "run/VRattleRun.h"
-#include <algorithm>
+#include "constraints/DistanceConstraint.h"
+#include "expressions/ExpressionGroup.h"
+#include "openmm/Vec3.h"
 #include <cmath>
 #include <functional>
 #include <random>
@@ -131,17 +132,6 @@ inline std::vector<OpenMM::Vec3> forcesAt(const std::vector<OpenMM::Vec3>& posit
     for (size_t i = 0; i < positions.size(); i++)
         forces.push_back(OpenMM::Vec3(5 * std::sin(positions[i][0]), -10 * positions[i][1], 3.0 - (double) (i % 7)));
     return forces;
-}
-
-/** Whole steps in that field. */
-inline void takeSteps(VRattleRun& dynamics, int steps) {
-    for (int i = 0; i < steps; i++) {
-        std::vector<OpenMM::Vec3> forces;
-        do {
-            dynamics.step(INFINITY);
-            forces = forcesAt(dynamics.getNextPositions());
-        } while (!dynamics.finish(forces, 0));
-    }
 }
 
 } // namespace OpenMMVRattle

@@ -131,10 +131,19 @@ void testEliminations() {
             ASSERT(cut.pieces.size() > 3 && !cut.joints.empty());
             testElimination(cluster, cut, goal);
         }
-    // Few levels where there can be few.
-    const Particles chain = makeMolecule(1500, 0, 0);
-    ASSERT(ClusterElimination(chain, leaveWhole(chain), ClusterElimination::FewLevels).pieces[0].numLevels <= 11);
-    ASSERT(!ClusterElimination(chain, leaveWhole(chain), ClusterElimination::FewLevels).hasWideColumns);
+    // Few levels where there can be few, of a whole cluster and in pieces.
+    ClusterKind chain;
+    chain.particlesOf = makeMolecule(1500, 0, 0);
+    const ClusterElimination whole = chain.eliminateInRounds(), inPieces = chain.eliminateInRounds(100);
+    ASSERT(whole.pieces.size() == 1 && whole.joints.empty() && !whole.hasWideColumns);
+    ASSERT(whole.pieces[0].numLevels <= 11);
+    ASSERT(inPieces.pieces.size() > 10);
+    size_t count = inPieces.joints.size();
+    for (const ClusterElimination::Piece& piece : inPieces.pieces) {
+        ASSERT(piece.constraints.size() <= 150 && piece.numLevels <= 8);
+        count += piece.constraints.size();
+    }
+    ASSERT_EQUAL(chain.particlesOf.size(), count);
     Particles star;
     for (int i = 1; i <= 60; i++)
         star.push_back({0, i});

@@ -54,6 +54,17 @@ Example makeSmallClusters(int count) {
     return e;
 }
 
+// Many bonds on one bead: all are coupled, and the factor is a dense panel.
+Example makeStar(int bonds) {
+    Example e;
+    e.add(5000, Vec3());
+    for (int i = 0; i < bonds; i++) {
+        const Vec3 r = e.randomVector(1);
+        e.join(0, e.add(50, r * (1 / std::sqrt(r.dot(r)))));
+    }
+    return e;
+}
+
 /** A solver at the positions of an example, and the same statements with Eigen. */
 struct Pair {
     Pair(const Example& e, bool isDense, int numThreads) :
@@ -326,6 +337,7 @@ int main() {
         add("a comb", makeComb(3000), false);
         add("a rod, dense", makeRod(15), true);
         add("a rod", makeRod(500), false);
+        add("a star of bonds, dense", makeStar(400), true);
         add("a comb in pieces", makeComb(15500), false);
         add("a rod in pieces", makeRod(3600), false);
     }

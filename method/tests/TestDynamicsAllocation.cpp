@@ -3,7 +3,7 @@
 
 // Once a run is going, a step allocates no memory; so it does not fall back on Newton's full matrix, which would.
 
-#include "Examples.h"
+#include "Steps.h"
 #include "TestSupport.h"
 #include <atomic>
 #include <cmath>

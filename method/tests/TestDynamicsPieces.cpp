@@ -4,7 +4,7 @@
 // Clusters so large that they are cut into pieces: the cut, K and the steps against Eigen's sparse factorisation of the same
 // matrix.
 
-#include "Examples.h"
+#include "Steps.h"
 #include "TestSupport.h"
 #include "constraints/ClusterCut.h"
 #include <Eigen/SparseCholesky>

@@ -4,7 +4,7 @@
 // All that threads share, on threads in truth: the same bits as on one thread, and exceptions that reach the caller. Under
 // ThreadSanitizer (make sanitize-threads) these tests also find accesses without order.
 
-#include "Examples.h"
+#include "Steps.h"
 #include "TestSupport.h"
 #include "constraints/SharedWork.h"
 #include "run/VRattleRun.h"

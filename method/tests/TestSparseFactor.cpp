@@ -5,13 +5,13 @@
 
 #include "Examples.h"
 #include "TestSupport.h"
+#include "constraints/ConstraintSystem.h"
 #include "constraints/SparseFactor.h"
 #include <Eigen/Dense>
 #include <algorithm>
 #include <set>
 
 using namespace OpenMMVRattle;
-using OpenMM::Vec3;
 using std::vector;
 
 namespace {
@@ -255,45 +255,6 @@ void testOuterRows(int size, int numOuter, const MatrixEntries& given) {
     ASSERT((inner * x + coupling.transpose() * outer - right).norm() <= 1e-12 * right.norm());
 }
 
-// Many bonds on one bead: steps, and their multipliers from the dense matrix.
-void testStar() {
-    Example e;
-    e.add(5000, Vec3());
-    for (int i = 0; i < 400; i++) {
-        const Vec3 r = e.randomVector(1);
-        e.join(0, e.add(50, r * (1 / std::sqrt(r.dot(r)))));
-    }
-    VRattleRun dynamics(e.masses, e.distances);
-    dynamics.setSettings(
-        {1e-3, 0, 0, 1e-10, StepDensity::SemiExplicit, {{StepMonitor::ConstraintForce, 1.0, 1.0, 0.0}}, false});
-    const vector<Vec3> forces = forcesAt(e.positions);
-    dynamics.begin(e.positions, e.velocities, forces, 0);
-    takeSteps(dynamics, 5);
-    const ConstraintSystem& system = dynamics.getConstraintSystem();
-    const int m = system.getNumConstraints();
-    Eigen::MatrixXd rows = Eigen::MatrixXd::Zero(m, 3 * e.masses.size());
-    Eigen::VectorXd inverseMasses(rows.cols()), right(m);
-    vector<double> curvature(m);
-    system.evaluateCurvature(dynamics.getPositions(), dynamics.getVelocities(), dynamics.getParameters(), curvature);
-    for (int i = 0; i < rows.cols(); i++)
-        inverseMasses[i] = 1 / e.masses[i / 3];
-    for (int k = 0; k < m; k++) {
-        const DistanceConstraint& c = system.getConstraint(k);
-        const Vec3 r = dynamics.getPositions()[c.particle1] - dynamics.getPositions()[c.particle2];
-        ASSERT_EQUAL_TOL(c.length, std::sqrt(r.dot(r)), 1e-10);
-        right[k] = curvature[k];
-        for (int j = 0; j < 3; j++) {
-            rows(k, 3 * c.particle1 + j) = r[j] / (c.length * c.length);
-            rows(k, 3 * c.particle2 + j) = -r[j] / (c.length * c.length);
-        }
-    }
-    for (int i = 0; i < rows.cols(); i++)
-        right += rows.col(i) * (inverseMasses[i] * dynamics.getForces()[i / 3][i % 3]);
-    const Eigen::VectorXd expected = (rows * inverseMasses.asDiagonal() * rows.transpose()).llt().solve(right);
-    ASSERT((expected - Eigen::VectorXd::Map(dynamics.getMultipliers().data(), m)).norm() <= 1e-9 * expected.norm());
-    ASSERT_EQUAL(0, dynamics.getNumRescues());
-}
-
 int main() {
     return runTests({
         {"order, a chain", [] { testOrder(300, makeChain(300), false); }},
@@ -317,6 +278,5 @@ int main() {
         {"factor, one row", [] { testFactor(2, makeChain(2)); }},
         {"outer rows, a chain", [] { testOuterRows(300, 3, makeChain(300)); }},
         {"outer rows, a cube", [] { testOuterRows(512, 40, makeCube(8)); }},
-        {"a star of bonds", testStar},
     });
 }

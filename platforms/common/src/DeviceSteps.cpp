@@ -213,7 +213,7 @@ bool DeviceSteps::prepareNewton() {
     if (newton || !NewtonSteps::canTake(large))
         return false;
     OpenMM::ContextSelector selector(context);
-    newton = std::make_unique<NewtonSteps>(context, large, isMixed);
+    newton = std::make_unique<NewtonSteps>(context, layout, large, isMixed);
     compile();
     return true;
 }

@@ -4,6 +4,7 @@
 #include "ExpressionClusters.h"
 #include "ExpressionCode.h"
 #include "ExpressionTexts.h"
+#include "LargeClusters.h"
 #include <algorithm>
 #include <numeric>
 #include <set>
@@ -111,8 +112,7 @@ ExpressionClusters::ExpressionClusters(const ClusterLayout& layout, const vector
         if (!kind.hasExpressions)
             continue;
         if (eliminations.count(cluster.kind) == 0)
-            eliminations[cluster.kind] =
-                ClusterElimination(kind.particlesOf, leaveWhole(kind.particlesOf), ClusterElimination::FewLevels);
+            eliminations[cluster.kind] = kind.eliminateInRounds();
         if (!open.rows.empty() && (int) open.rows.size() + kind.getNumConstraints() > PART_SIZE) {
             addPart(open, layout.inverseMasses);
             open = Part();
@@ -127,37 +127,27 @@ ExpressionClusters::ExpressionClusters(const ClusterLayout& layout, const vector
     addPart(open, layout.inverseMasses);
 }
 
-ExpressionClusters::ExpressionClusters(const LargeClusters& large) :
-        parameters(large.getNumConstraints()), numParameters(0), numConstraints(0), numLevels(0), numWork(0),
-        numFactorEntries(0) {
+ExpressionClusters::ExpressionClusters(const ClusterLayout& layout) :
+        numParameters(0), numConstraints(0), numLevels(0), numWork(0), numFactorEntries(0) {
     kindOf({DISTANCE_EXPRESSION, {0, 1}, {{"length", 1.0}}});
-    const auto& pieces = large.getPieces();
-    const vector<double> areMoving(1 + *std::max_element(large.getAtoms().begin(), large.getAtoms().end()), 1.0);
-    for (size_t first = 0; first < pieces.size(); first += pieces[first].numPieces) {
-        vector<Row> rows;
-        vector<vector<int>> particlesOf;
-        std::map<int, int> places; // of the particles of the cluster
-        for (size_t piece = first; piece < first + pieces[first].numPieces; piece++)
-            for (int i = 0; i < pieces[piece].numInner + pieces[piece].numBorders; i++) {
-                const int place = pieces[piece].firstRow + i;
-                const LargeClusters::Row& row = large.getRows()[place];
-                if (row.number < 0)
-                    continue; // another piece's
-                rows.push_back({DISTANCE, row.number, NONE, {row.atom1, row.atom2}});
-                parameters[row.number] = large.getRowLengths()[place];
-                particlesOf.emplace_back();
-                for (int atom : {row.atom1, row.atom2})
-                    particlesOf.back().push_back(places.emplace(atom, (int) places.size()).first->second);
-            }
-        const ClusterElimination elimination(particlesOf, leaveWhole(particlesOf), ClusterElimination::FewLevels);
+    for (const ClusterKind* kind : LargeClusters::findKinds(layout)) {
+        const ClusterElimination elimination = kind->eliminateInRounds();
         const ClusterElimination::Piece& whole = elimination.pieces[0];
-        Part part;
-        for (int k : whole.constraints)
-            part.rows.push_back(rows[k]);
-        part.firstRows = {0};
-        part.levels = whole.levels;
-        part.columns = whole.columns;
-        addPart(part, areMoving);
+        for (int c = 0; c < kind->getNumClusters(); c++) {
+            const int first = (int) parameters.size();
+            for (int k = 0; k < kind->getNumConstraints(); k++)
+                parameters.push_back(layout.distances[kind->getConstraint(c, k)].length);
+            Part part;
+            for (int k : whole.constraints) {
+                const vector<int>& ends = kind->particlesOf[k];
+                part.rows.push_back(
+                    {DISTANCE, first + k, NONE, {kind->getParticle(c, ends[0]), kind->getParticle(c, ends[1])}});
+            }
+            part.firstRows = {0};
+            part.levels = whole.levels;
+            part.columns = whole.columns;
+            addPart(part, layout.inverseMasses);
+        }
     }
 }
 

@@ -4,7 +4,6 @@
 #ifndef OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 #define OPENMMVRATTLE_EXPRESSIONCLUSTERS_H_
 
-#include "LargeClusters.h"
 #include "constraints/ClusterLayout.h"
 #include "expressions/ExpressionDerivatives.h"
 #include <cstddef>
@@ -33,9 +32,9 @@ public:
     ExpressionClusters(const ClusterLayout& layout, const std::vector<ExpressionConstraint>& expressions);
     /**
      * The large clusters of distances, each a part of its own. The parameter of a row is the length of its constraint, by the number that
-     * this has there.
+     * this has in LargeClusters.
      */
-    explicit ExpressionClusters(const LargeClusters& large);
+    explicit ExpressionClusters(const ClusterLayout& layout);
     bool isEmpty() const {
         return parts.empty();
     }

@@ -2,8 +2,6 @@
 // SPDX-License-Identifier: MIT
 
 #include "LargeClusters.h"
-#include "constraints/ClusterCut.h"
-#include "constraints/ClusterElimination.h"
 #include <algorithm>
 #include <cstdint>
 #include <map>
@@ -51,11 +49,7 @@ const int MANY_JOINTS = 1024, SMALLEST_PIECE = 24;
 // As in kernels/large.cc.
 const int SPLIT = 8;
 // A cluster of so many pieces is left whole, unless it does not fit into local memory.
-const double WHOLE = 2.5;
-
-bool isLarge(const ClusterKind& kind) {
-    return !kind.isSmall() && !kind.hasExpressions;
-}
+const double FEW_PIECES = 2.5;
 
 int roundUp(size_t value, int unit) {
     return (int) ((value + unit - 1) / unit * unit);
@@ -234,9 +228,9 @@ struct LargeClusters::Layout {
 LargeClusters::LargeClusters(const ClusterLayout& layout, const Limits& limits) :
         form(), numThreads(limits.numThreads), narrow(limits.narrow), localMemory(limits.localMemory) {
     size_t total = 0;
-    for (const ClusterKind& kind : layout.kinds)
-        if (isLarge(kind) && kind.getNumConstraints() > WHOLE * limits.pieceSize)
-            total += kind.constraints.size();
+    for (const ClusterKind* kind : findKinds(layout))
+        if (kind->getNumConstraints() > FEW_PIECES * limits.pieceSize)
+            total += kind->constraints.size();
     int pieceSize = limits.pieceSize;
     if (limits.numResident > 0)
         pieceSize = std::max(pieceSize, (int) (1.1 * (double) total / limits.numResident));
@@ -258,19 +252,27 @@ LargeClusters::LargeClusters(const ClusterLayout& layout, const Limits& limits) 
     tables.resize(tables.size() + 4 * (size_t) (limits.numThreads + 1), 0);
 }
 
+vector<const ClusterKind*> LargeClusters::findKinds(const ClusterLayout& layout) {
+    vector<const ClusterKind*> kinds;
+    for (auto kind = layout.kinds.rbegin(); kind != layout.kinds.rend(); ++kind)
+        if (!kind->isSmall() && !kind->hasExpressions)
+            kinds.push_back(&*kind);
+    return kinds;
+}
+
 // Whether it is in global memory for want of room alone.
 bool LargeClusters::isTooLarge() const {
     return form.areRecords && !form.isStaged && !form.isInLocalMemory;
 }
 
 void LargeClusters::build(const ClusterLayout& layout, const Limits& limits, int pieceSize) {
-    // Those with most constraints first; returns whether there was a place for all.
+    // Returns whether there was a place for all.
     auto addKinds = [&](bool areRecords, int size) {
         clear();
         form.areRecords = areRecords;
-        return std::all_of(layout.kinds.rbegin(), layout.kinds.rend(), [&](const ClusterKind& kind) {
-            return !isLarge(kind) || addKind(layout, kind, limits, size);
-        });
+        const vector<const ClusterKind*> kinds = findKinds(layout);
+        return std::all_of(kinds.begin(), kinds.end(),
+                           [&](const ClusterKind* kind) { return addKind(layout, *kind, limits, size); });
     };
     if (!addKinds(true, pieceSize))
         addKinds(false, 0);
@@ -301,10 +303,8 @@ void LargeClusters::clear() {
 bool LargeClusters::addKind(const ClusterLayout& given, const ClusterKind& kind, const Limits& limits, int pieceSize) {
     const int count = kind.getNumConstraints();
     const vector<vector<int>>& particlesOf = kind.particlesOf;
-    const bool isCut = pieceSize > 0 && count > WHOLE * pieceSize;
-    const ClusterElimination cluster(particlesOf,
-                                     isCut ? cutClusterAlongTree(particlesOf, pieceSize) : leaveWhole(particlesOf),
-                                     ClusterElimination::FewLevels);
+    const ClusterElimination cluster =
+        kind.eliminateInRounds(count > FEW_PIECES * pieceSize ? pieceSize : ClusterKind::WHOLE);
     const int numPieceJoints = (int) cluster.joints.size();
     if (numPieceJoints > MANY_JOINTS)
         return false;

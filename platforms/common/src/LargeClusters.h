@@ -52,6 +52,11 @@ public:
     };
 
     LargeClusters(const ClusterLayout& layout, const Limits& limits);
+    /**
+     * The kinds of such clusters, those with most constraints first. So their constraints are numbered: kind by kind and cluster by cluster,
+     * by their places in it.
+     */
+    static std::vector<const ClusterKind*> findKinds(const ClusterLayout& layout);
     bool isEmpty() const {
         return pieces.empty();
     }

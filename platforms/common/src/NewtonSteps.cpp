@@ -16,8 +16,9 @@ bool NewtonSteps::canTake(const LargeClusters& large) {
     return !large.isEmpty() && large.getNumFactors() <= MOST_ENTRIES;
 }
 
-NewtonSteps::NewtonSteps(OpenMM::ComputeContext& context, const LargeClusters& large, bool isMixed) :
-        context(context), clusters(large), isMixed(isMixed), numThreads(large.getNumThreads()) {
+NewtonSteps::NewtonSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout, const LargeClusters& large,
+                         bool isMixed) :
+        context(context), clusters(layout), isMixed(isMixed), numThreads(large.getNumThreads()) {
     const int mixedSize = isMixed ? 8 : 4;
     auto uploadInts = [&](ComputeArray& array, const vector<int>& data, const char* name) {
         array.initialize<int>(context, data.size(), name);

@@ -28,7 +28,7 @@ public:
     };
     /** Whether there is something to be solved, and the memory for it is not too much. */
     static bool canTake(const LargeClusters& large);
-    NewtonSteps(OpenMM::ComputeContext& context, const LargeClusters& large, bool isMixed);
+    NewtonSteps(OpenMM::ComputeContext& context, const ClusterLayout& layout, const LargeClusters& large, bool isMixed);
     const ExpressionClusters& getClusters() const {
         return clusters;
     }

@@ -93,7 +93,7 @@ int main(int argc, char** argv) {
     const int mixedSize = precision == "single" ? 4 : 8, realSize = precision == "double" ? 8 : 4;
     const LargeClusters large(layout,
                               {StepProgram::getGroupSize(true), 40 * 1024, 132, 32, mixedSize, realSize, 792, 64});
-    const std::unique_ptr<ExpressionClusters> newton(hasNewton ? new ExpressionClusters(large) : nullptr);
+    const std::unique_ptr<ExpressionClusters> newton(hasNewton ? new ExpressionClusters(layout) : nullptr);
     const StepProgram program(layout, large, clusters.get(), newton.get(), StepProgram::getGroupSize(true), terms,
                               update, precision != "single", true);
     for (const auto& define : program.getDefines())
