@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 
 #include "constraints/ClusterBatch.h"
+#include "constraints/ClusterStages.h"
 #include "constraints/Pack.h"
 #include "constraints/Sum.h"
 #include "constraints/Wide.h"
@@ -120,10 +121,10 @@ public:
     int getFirstConstraint(int cluster) const override {
         return firstConstraint + cluster * B;
     }
-    double solvePositions(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+    double solvePositions(const StepArrays& step, int first, int end, const ChordStages& stages,
                           int& numUpdates) const override {
-        return hasWideVectors() ? solveWide(step, first, end, iteration, numUpdates)
-                                : solve(step, first, end, iteration, numUpdates);
+        return hasWideVectors() ? solveWide(step, first, end, stages, numUpdates)
+                                : solve(step, first, end, stages, numUpdates);
     }
     double coupledPass(const StepArrays& step, int first, int end) const override {
         return hasWideVectors() ? passWide(step, first, end) : pass(step, first, end);
@@ -133,10 +134,10 @@ public:
     }
 
 private:
-    double solve(const StepArrays& step, int first, int end, const ChordIteration& iteration, int& numUpdates) const;
-    OPENMMVRATTLE_WIDE double solveWide(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+    double solve(const StepArrays& step, int first, int end, const ChordStages& stages, int& numUpdates) const;
+    OPENMMVRATTLE_WIDE double solveWide(const StepArrays& step, int first, int end, const ChordStages& stages,
                                         int& numUpdates) const {
-        return solve(step, first, end, iteration, numUpdates);
+        return solve(step, first, end, stages, numUpdates);
     }
     double pass(const StepArrays& step, int first, int end) const;
     OPENMMVRATTLE_WIDE double passWide(const StepArrays& step, int first, int end) const {
@@ -170,6 +171,12 @@ private:
         Pack lower[B][B];
         Pack inversePivot[B];
     };
+
+    struct Clusters;
+    struct FinishClusters;
+    struct TrialClusters;
+    struct ChordClusters;
+    struct CoupledClusters;
 
     static void fill(Shape& shape, int lane, const ClusterShape& cluster) {
         for (int i = 0; i < P; i++)
@@ -240,9 +247,9 @@ private:
     };
     static void factorizeNewton(const Shape& shape, const PackVector* next, const Factor& rows, NewtonFactor& factor);
     static void solve(const NewtonFactor& factor, Pack* x);
-    /** result_k = sum_l C_kl x_l row_l: the bond vectors of M^-1 G^T x. */
+    /** result_k = bonds_k + scale sum_l C_kl x_l row_l: what the motion M^-1 G^T x adds to bond vectors. */
     static void addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
-                                   PackVector* bonds);
+                                   const PackVector* bonds, PackVector* result);
     /** x_i += scale / mass * (G^T x)_i */
     static void addConstraintForces(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
                                     PackVector* particleVectors);
@@ -328,13 +335,16 @@ template <class Topology> void BatchOf<Topology>::solve(const NewtonFactor& fact
 
 template <class Topology>
 void BatchOf<Topology>::addConstraintBonds(const Shape& shape, const Factor& factor, const Pack* x, Pack scale,
-                                           PackVector* bonds) {
+                                           const PackVector* bonds, PackVector* result) {
     PackVector force[B];
     for (int l = 0; l < B; l++)
         force[l] = factor.row[l] * (scale * x[l]);
-    for (int k = 0; k < B; k++)
+    for (int k = 0; k < B; k++) {
+        PackVector sum = bonds[k];
         for (int l = 0; l < B; l++)
-            bonds[k] = bonds[k] + force[l] * shape.massCoupling[k][l];
+            sum = sum + force[l] * shape.massCoupling[k][l];
+        result[k] = sum;
+    }
 }
 
 template <class Topology>
@@ -348,166 +358,219 @@ void BatchOf<Topology>::addConstraintForces(const Shape& shape, const Factor& fa
     }
 }
 
+/** A pack of clusters with the algebra of their constraints, in registers; what the stages of a pass work on. */
+template <class Topology> struct BatchOf<Topology>::Clusters {
+    Clusters(const BatchOf& batch, int first, int end, const Vec3* positions) :
+            lanes(batch.lanesOf(first, end)), shape(batch.shapeOf(first)) {
+        load(positions, q);
+        forConstraints([&](int k) { r[k] = bondOf(q, k); });
+    }
+    template <class Task> static void forParticles(const Task& task) {
+        for (int i = 0; i < P; i++)
+            task(i);
+    }
+    template <class Task> static void forConstraints(const Task& task) {
+        for (int k = 0; k < B; k++)
+            task(k);
+    }
+    void load(const Vec3* from, PackVector* to) const {
+        forParticles([&](int i) { to[i] = BatchOf::load(lanes, i, from); });
+    }
+    void load(const double* from, Pack* to) const {
+        forConstraints([&](int k) { to[k] = BatchOf::load(lanes, k, from); });
+    }
+    void store(const PackVector* from, Vec3* to) const {
+        forParticles([&](int i) { BatchOf::store(lanes, i, from[i], to); });
+    }
+    void store(const Pack* from, double* to) const {
+        forConstraints([&](int k) { BatchOf::store(lanes, k, from[k], to); });
+    }
+    void multiply(const PackVector* w, Pack* x) const {
+        forConstraints([&](int k) { x[k] = dot(factor.row[k], bondOf(w, k)); });
+    }
+    void addTransposedOverMass(const Pack* x, double scale, PackVector* result) const {
+        addConstraintForces(shape, factor, x, packOf(scale), result);
+    }
+    void solve(Pack* x) const {
+        BatchOf::solve(factor, x);
+    }
+    const Lanes lanes;
+    const Shape& shape;
+    Factor factor;
+    PackVector q[P], r[B];
+};
+
+template <class Topology> struct BatchOf<Topology>::FinishClusters : Clusters {
+    FinishClusters(const BatchOf& batch, int first, int end, const OnStepArrays& step) :
+            Clusters(batch, first, end, step.q), kick(packOf(step.kick)), hasHalfStep(step.lambdaHalf != nullptr),
+            hasNetAccelerations(step.acceleration != nullptr) {
+        this->load(step.w, w);
+        this->load(step.force, netAccelerations);
+        this->forParticles([&](int i) { netAccelerations[i] = netAccelerations[i] * this->shape.inverseMass[i]; });
+        factorize(this->shape, this->r, this->factor);
+    }
+    const PackVector& getAcceleration(int i) const {
+        return netAccelerations[i]; // until the constraints' are added, in the end
+    }
+    void multiplyAccelerations(Pack* x) const {
+        this->multiply(netAccelerations, x);
+    }
+    void addParameterMotion(Pack*) const { // distances have no parameters that move
+    }
+    void evaluateCurvature(const PackVector* velocities, Pack* x) const {
+        this->forConstraints([&](int k) {
+            const PackVector velocity = bondOf(velocities, k);
+            x[k] = dot(velocity, velocity) * this->shape.inverseSquareLength[k];
+        });
+    }
+    void store(const OnStepArrays& step) const {
+        Clusters::store(v, step.v);
+        Clusters::store(rightSide, step.rightSide);
+        Clusters::store(multipliers, step.lambda);
+        if (hasNetAccelerations)
+            Clusters::store(netAccelerations, step.acceleration);
+        if (hasHalfStep) {
+            Clusters::store(halfRightSide, step.rightSideHalf);
+            Clusters::store(halfMultipliers, step.lambdaHalf);
+        }
+    }
+    const Pack kick;
+    const bool hasHalfStep, hasNetAccelerations;
+    PackVector w[P], v[P], netAccelerations[P];
+    Pack change[B], applied[B], rightSide[B], multipliers[B], halfRightSide[B], halfMultipliers[B];
+};
+
+/** The numbers of a trial, the same for all packs. */
+struct Scales {
+    explicit Scales(const StepArrays& step) :
+            kick(packOf(step.kick)), drift(packOf(step.drift)), inverseDrift(packOf(1 / step.drift)),
+            forward(packOf(-step.kick * step.drift)), backward(packOf(1 / (step.kick * step.drift))) {
+    }
+    const Pack kick, drift, inverseDrift;
+    const Pack forward, backward; // from a change of lambda to that of g, and back
+};
+
+/** Those of a trial, which is followed bond by bond: next is where it leads. */
+template <class Topology> struct BatchOf<Topology>::TrialClusters : Clusters {
+    TrialClusters(const BatchOf& batch, int first, int end, const StepArrays& step, const Scales& scales) :
+            Clusters(batch, first, end, step.q), scales(scales) {
+        this->load(step.start, w);
+        this->load(step.lambda, lambda);
+    }
+    /** When w is what it is without constraints. */
+    void beginBonds() {
+        this->forConstraints([&](int k) { unconstrained[k] = this->r[k] + bondOf(w, k) * scales.drift; });
+    }
+    void move(bool) {
+        addConstraintBonds(this->shape, this->factor, lambda, scales.forward, unconstrained, next);
+    }
+    double evaluate(Pack* g) const {
+        BatchOf::evaluate(this->shape, next, g);
+        return largestOf(g);
+    }
+    Pack toUpdate(Pack x) const {
+        return x * scales.backward;
+    }
+    void store(const StepArrays& step) {
+        addConstraintForces(this->shape, this->factor, lambda, -scales.kick, w);
+        Clusters::store(w, step.wNext);
+        this->forParticles(
+            [&](int i) { BatchOf::store(this->lanes, i, this->q[i] + w[i] * scales.drift, step.qNext); });
+        Clusters::store(lambda, step.lambda);
+    }
+    const Scales& scales;
+    PackVector w[P], unconstrained[B], next[B];
+    Pack lambda[B], change[B];
+};
+
+/** Their matrix is Newton's at the guess. */
+template <class Topology> struct BatchOf<Topology>::ChordClusters : TrialClusters {
+    ChordClusters(const BatchOf& batch, int first, int end, const StepArrays& step, const Scales& scales) :
+            TrialClusters(batch, first, end, step, scales), isFactorized(false) {
+        if (step.force != nullptr)
+            this->forParticles([&](int i) {
+                this->w[i] =
+                    this->w[i] + BatchOf::load(this->lanes, i, step.force) * (scales.kick * this->shape.inverseMass[i]);
+            });
+        this->forConstraints([&](int k) { this->factor.row[k] = this->r[k] * this->shape.inverseSquareLength[k]; });
+        this->beginBonds();
+    }
+    void solve(Pack* x) {
+        if (!isFactorized)
+            factorizeNewton(this->shape, this->next, this->factor, newtonFactor);
+        isFactorized = true;
+        BatchOf::solve(newtonFactor, x);
+    }
+    NewtonFactor newtonFactor;
+    bool isFactorized;
+};
+
+template <class Topology> struct BatchOf<Topology>::CoupledClusters : TrialClusters {
+    CoupledClusters(const BatchOf& batch, int first, int end, const StepArrays& step, const Scales& scales) :
+            TrialClusters(batch, first, end, step, scales) {
+        PackVector accelerations[P];
+        this->load(step.force, accelerations);
+        this->forParticles([&](int i) {
+            accelerations[i] = accelerations[i] * this->shape.inverseMass[i];
+            this->w[i] = this->w[i] + accelerations[i] * scales.kick;
+        });
+        this->beginBonds();
+        factorize(this->shape, this->r, this->factor);
+        this->multiply(accelerations, applied);
+        this->load(step.change, this->change);
+    }
+    // Of w+, which is known by its bonds.
+    void evaluateCurvature(Pack* x) const {
+        this->forConstraints([&](int k) {
+            const PackVector velocity = (this->next[k] - this->r[k]) * this->scales.inverseDrift;
+            x[k] = dot(velocity, velocity) * this->shape.inverseSquareLength[k];
+        });
+    }
+    void store(const StepArrays& step) {
+        TrialClusters::store(step);
+        Clusters::store(rightSide, step.rightSidePlus);
+        Clusters::store(multipliers, step.lambdaPlus);
+        this->forConstraints([&](int k) { this->change[k] = this->toUpdate(this->change[k]); });
+        Clusters::store(this->change, step.change);
+    }
+    Pack applied[B], rightSide[B], multipliers[B];
+};
+
 template <class Topology>
-double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+double BatchOf<Topology>::solve(const StepArrays& step, int first, int end, const ChordStages& stages,
                                 int& numUpdates) const {
-    const Pack kick = packOf(step.kick), drift = packOf(step.drift);
-    const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
+    const Scales scales(step);
     double worst = 0;
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
-        const Lanes lanes = lanesOf(cluster, end);
-        const Shape& shape = shapeOf(cluster);
-        PackVector q[P], w[P], r[B], unconstrained[B], next[B];
-        for (int i = 0; i < P; i++) {
-            q[i] = load(lanes, i, step.q);
-            w[i] = load(lanes, i, step.start);
-            if (step.force != nullptr)
-                w[i] = w[i] + load(lanes, i, step.force) * (kick * shape.inverseMass[i]);
-        }
-        for (int k = 0; k < B; k++) {
-            r[k] = bondOf(q, k);
-            unconstrained[k] = r[k] + bondOf(w, k) * drift;
-        }
-        Factor rows;
-        for (int k = 0; k < B; k++)
-            rows.row[k] = r[k] * shape.inverseSquareLength[k];
-        Pack lambda[B], g[B];
-        for (int k = 0; k < B; k++)
-            lambda[k] = load(lanes, k, step.lambda);
-        NewtonFactor factor;
-        double error = 0, previous = std::numeric_limits<double>::infinity();
-        int updates = 0;
-        while (true) {
-            for (int k = 0; k < B; k++)
-                next[k] = unconstrained[k];
-            addConstraintBonds(shape, rows, lambda, scale, next);
-            evaluate(shape, next, g);
-            error = largestOf(g);
-            if (iteration.isOver(updates, error, previous))
-                break;
-            if (updates == 0)
-                factorizeNewton(shape, next, rows, factor);
-            solve(factor, g);
-            for (int k = 0; k < B; k++)
-                lambda[k] += g[k] * inverseScale;
-            previous = error;
-            updates++;
-        }
-        numUpdates = std::max(numUpdates, updates);
-        worst = largerOf(worst, error);
-        addConstraintForces(shape, rows, lambda, -kick, w);
-        for (int i = 0; i < P; i++) {
-            store(lanes, i, w[i], step.wNext);
-            store(lanes, i, q[i] + w[i] * drift, step.qNext);
-        }
-        for (int k = 0; k < B; k++)
-            store(lanes, k, lambda[k], step.lambda);
+        ChordClusters clusters(*this, cluster, end, step, scales);
+        const StagesResult result = runStages(stages, clusters);
+        worst = largerOf(worst, result.error);
+        numUpdates = std::max(numUpdates, result.stage);
+        clusters.store(step);
     }
     return worst;
 }
 
 template <class Topology> double BatchOf<Topology>::pass(const StepArrays& step, int first, int end) const {
-    const Pack kick = packOf(step.kick), drift = packOf(step.drift), inverseDrift = packOf(1 / step.drift);
-    const Pack scale = packOf(-step.kick * step.drift), inverseScale = packOf(1 / (step.kick * step.drift));
+    const Scales scales(step);
+    const CoupledStages stages;
     double worst = 0;
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
-        const Lanes lanes = lanesOf(cluster, end);
-        const Shape& shape = shapeOf(cluster);
-        PackVector q[P], w[P], acceleration[P], r[B], next[B];
-        for (int i = 0; i < P; i++) {
-            q[i] = load(lanes, i, step.q);
-            acceleration[i] = load(lanes, i, step.force) * shape.inverseMass[i];
-            w[i] = load(lanes, i, step.start) + acceleration[i] * kick;
-        }
-        for (int k = 0; k < B; k++) {
-            r[k] = bondOf(q, k);
-            next[k] = r[k] + bondOf(w, k) * drift;
-        }
-        Factor factor;
-        factorize(shape, r, factor);
-        Pack lambda[B], g[B], multipliers[B];
-        for (int k = 0; k < B; k++) {
-            lambda[k] = load(lanes, k, step.lambda) + load(lanes, k, step.change);
-            store(lanes, k, lambda[k], step.lambda);
-        }
-        addConstraintBonds(shape, factor, lambda, scale, next);
-        evaluate(shape, next, g);
-        worst = largerOf(worst, largestOf(g));
-        // Lambda(q, p+) = K^-1 (g''(w+,w+) + G M^-1 F)
-        for (int k = 0; k < B; k++) {
-            const PackVector velocity = (next[k] - r[k]) * inverseDrift;
-            multipliers[k] =
-                dot(velocity, velocity) * shape.inverseSquareLength[k] + dot(factor.row[k], bondOf(acceleration, k));
-            store(lanes, k, multipliers[k], step.rightSidePlus);
-        }
-        solve(factor, multipliers);
-        solve(factor, g);
-        for (int k = 0; k < B; k++) {
-            store(lanes, k, multipliers[k], step.lambdaPlus);
-            store(lanes, k, g[k] * inverseScale, step.change);
-        }
-        addConstraintForces(shape, factor, lambda, -kick, w);
-        for (int i = 0; i < P; i++) {
-            store(lanes, i, w[i], step.wNext);
-            store(lanes, i, q[i] + w[i] * drift, step.qNext);
-        }
+        CoupledClusters clusters(*this, cluster, end, step, scales);
+        stages.prepare(clusters);
+        worst = largerOf(worst, runStages(stages, clusters).error);
+        clusters.store(step);
     }
     return worst;
 }
 
 template <class Topology> double BatchOf<Topology>::complete(const OnStepArrays& step, int first, int end) const {
-    const Pack kick = packOf(step.kick);
     double smallestPivot = std::numeric_limits<double>::infinity();
     for (int cluster = first; cluster < end; cluster += PACK_SIZE) {
-        const Lanes lanes = lanesOf(cluster, end);
-        const Shape& shape = shapeOf(cluster);
-        PackVector q[P], w[P], v[P], acceleration[P], r[B];
-        for (int i = 0; i < P; i++) {
-            q[i] = load(lanes, i, step.q);
-            w[i] = load(lanes, i, step.w);
-            acceleration[i] = load(lanes, i, step.force) * shape.inverseMass[i];
-            v[i] = w[i] + acceleration[i] * kick;
-        }
-        for (int k = 0; k < B; k++)
-            r[k] = bondOf(q, k);
-        Factor factor;
-        factorize(shape, r, factor);
-        keepSmallestPivot(shape, factor, smallestPivot);
-        Pack x[B], applied[B], multipliers[B];
-        for (int k = 0; k < B; k++) {
-            x[k] = dot(factor.row[k], bondOf(v, k));
-            applied[k] = dot(factor.row[k], bondOf(acceleration, k));
-        }
-        solve(factor, x);
-        addConstraintForces(shape, factor, x, packOf(-1), v);
-        for (int i = 0; i < P; i++)
-            store(lanes, i, v[i], step.v);
-        for (int k = 0; k < B; k++) {
-            const PackVector velocity = bondOf(v, k);
-            multipliers[k] = dot(velocity, velocity) * shape.inverseSquareLength[k] + applied[k];
-            store(lanes, k, multipliers[k], step.rightSide);
-        }
-        solve(factor, multipliers);
-        for (int k = 0; k < B; k++)
-            store(lanes, k, multipliers[k], step.lambda);
-        if (step.acceleration != nullptr) {
-            PackVector net[P];
-            for (int i = 0; i < P; i++)
-                net[i] = acceleration[i];
-            addConstraintForces(shape, factor, multipliers, packOf(-1), net);
-            for (int i = 0; i < P; i++)
-                store(lanes, i, net[i], step.acceleration);
-        }
-        if (step.lambdaHalf == nullptr)
-            continue;
-        for (int k = 0; k < B; k++) {
-            const PackVector velocity = bondOf(w, k);
-            x[k] = dot(velocity, velocity) * shape.inverseSquareLength[k] + applied[k];
-            store(lanes, k, x[k], step.rightSideHalf);
-        }
-        solve(factor, x);
-        for (int k = 0; k < B; k++)
-            store(lanes, k, x[k], step.lambdaHalf);
+        FinishClusters clusters(*this, cluster, end, step);
+        keepSmallestPivot(clusters.shape, clusters.factor, smallestPivot);
+        runStages(FinishStages(), clusters);
+        clusters.store(step);
     }
     return smallestPivot;
 }

@@ -4,8 +4,8 @@
 #ifndef OPENMMVRATTLE_CLUSTERBATCH_H_
 #define OPENMMVRATTLE_CLUSTERBATCH_H_
 
-#include "constraints/ChordIteration.h"
 #include "constraints/ClusterLayout.h"
+#include "constraints/ClusterStages.h"
 #include "openmm/Vec3.h"
 #include <memory>
 
@@ -68,7 +68,7 @@ public:
      * @param[in,out] numUpdates    the number of updates of the cluster that needed most
      * @return the largest |g| left; larger than the tolerance, or a NaN, if a cluster did not converge quickly
      */
-    virtual double solvePositions(const StepArrays& step, int first, int end, const ChordIteration& iteration,
+    virtual double solvePositions(const StepArrays& step, int first, int end, const ChordStages& stages,
                                   int& numUpdates) const = 0;
     /**
      * One pass of the coupled iteration: lambda += change, the positions and velocities from it, Lambda(q, p+), and the next

@@ -3,7 +3,7 @@
 
 // What ConstraintSolver does in a step: passes over all clusters.
 
-#include "constraints/ChordIteration.h"
+#include "constraints/ClusterStages.h"
 #include "constraints/ConstraintSolver.h"
 #include <algorithm>
 #include <cmath>
@@ -14,27 +14,14 @@ using OpenMM::Vec3;
 using std::vector;
 
 /*
- * A pass does the same to all clusters. The batches and the free particles have it done in one go. For the others it is a sequence of
- * stages, each of which moves the particles of a part, forms equations K x = b for one unknown or two, and has them solved. A part
- * of whole clusters goes through all stages at once; pieces of a cut cluster wait at the end of each for their joints, which have
- * equations and no particles.
+ * A pass does the same to all clusters. Batches and free particles have it done in one go. For the others it goes through stages
+ * (ClusterStages.h): a part of whole clusters through all of them at once; pieces of a cut cluster wait at the end of each for their
+ * joints, which have equations and no particles.
  */
-struct ConstraintSolver::Pass {
-    /** What K x = b is solved for, b at first; the second may be null. */
-    struct Unknowns {
-        vector<double>*first, *second;
-        /** task(x, channel) */
-        template <class Task> void forEach(const Task& task) const {
-            task(*first, 0);
-            if (second != nullptr)
-                task(*second, 1);
-        }
-    };
-    explicit Pass(ConstraintSolver& solver, Observer* observer = nullptr) :
-            solver(solver), system(solver.system), observer(observer) {
-    }
-    int numStages() const {
-        return 1;
+template <class StagesOfPass> struct ConstraintSolver::Pass {
+    typedef StagesOfPass Stages;
+    Pass(ConstraintSolver& solver, const Stages& stages, Observer* observer = nullptr) :
+            stages(stages), solver(solver), system(solver.system), observer(observer) {
     }
     /** The Jacobian of the matrix that is to be factorised before the first stage, if any. */
     const ConstraintSystem::Jacobian* toFactorize() const {
@@ -52,73 +39,86 @@ struct ConstraintSolver::Pass {
         if (observer != nullptr)
             observer->seeConstraints(solver.rangeOf(part), part.first, part.end);
     }
-    /** Before everything else, and for joints before all pieces. */
+    /** Before all stages, and for joints before all pieces. */
     void prepare(const Part&) const {
     }
-    /** Whether no more is to be solved for, which the largest errors of this stage and the one before tell. */
-    bool isLast(int, double, double) const {
-        return false;
-    }
-    /** Whether there is certainly something to solve for, even before the errors of other pieces are known. */
-    bool isCertain(int, double) const {
-        return true;
-    }
-    /** When the unknowns have been found. */
-    void update(const Part&) const {
-    }
-    /** When those of the last stage have, for all that has particles. */
-    void complete(const Part&) const {
-    }
+    const Stages stages;
     ConstraintSolver& solver;
     const ConstraintSystem& system;
     Observer* const observer;
 };
 
-// The chord iteration for (3.11), A = -kick drift K(q); each stage is an iteration.
-struct ConstraintSolver::ChordPass : Pass {
+/** A part of general clusters, a piece or joints, with the algebra of their constraints; what the stages of a pass work on. */
+struct ConstraintSolver::Clusters {
+    Clusters(ConstraintSolver& solver, const Part& part, const ConstraintSystem::Jacobian& jacobian) :
+            change(solver.correction), solver(solver), system(solver.system), part(part), jacobian(jacobian) {
+    }
+    template <class Task> void forParticles(const Task& task) const {
+        for (int p = part.firstParticle; p < part.endParticle; p++)
+            task(system.getGeneralParticles()[p]);
+    }
+    template <class Task> void forConstraints(const Task& task) const {
+        for (int k = part.first; k < part.end; k++)
+            task(k);
+    }
+    void multiply(const Vectors& w, vector<double>& x) const {
+        system.multiply(jacobian, w, x, part);
+    }
+    void addTransposedOverMass(const vector<double>& x, double scale, Vectors& result) const {
+        system.addTransposedOverMass(jacobian, x, scale, result, part);
+    }
+    void solve(vector<double>& x) const {
+        solver.matrix.solve(x, part);
+    }
+    vector<double>& change;
+    ConstraintSolver& solver;
+    const ConstraintSystem& system;
+    const Part& part;
+    const ConstraintSystem::Jacobian& jacobian;
+};
+
+struct ConstraintSolver::TrialClusters : Clusters {
+    TrialClusters(ConstraintSolver& solver, const Part& part, const Trial& trial) :
+            Clusters(solver, part, solver.jacobian), trial(trial), lambda(trial.multipliers) {
+    }
+    void move(bool withVelocities) const {
+        solver.moveParticles(trial, part, withVelocities);
+    }
+    double evaluate(vector<double>& g) const {
+        return system.evaluate(trial.positions, trial.parameters, g, jacobian, part);
+    }
+    double toUpdate(double x) const {
+        return x / (trial.kick * trial.drift);
+    }
+    const Trial& trial;
+    vector<double>& lambda;
+};
+
+// The chord iteration for (3.11), A = -kick drift K(q).
+struct ConstraintSolver::ChordPass : Pass<ChordStages> {
     ChordPass(ConstraintSolver& solver, const Trial& trial, const Guess& guess) :
             ChordPass(solver, trial, guess, *solver.q, solver.force->data()) {
     }
     ChordPass(ConstraintSolver& solver, const Trial& trial, const Guess& guess, const Vectors& q, const Vec3* force) :
-            Pass(solver), trial(trial), guess(guess), arrays(solver.arraysOf(trial, q, force)),
-            iteration{guess.margin * solver.tolerance} {
-    }
-    int numStages() const {
-        return ChordIteration::MAX_UPDATES + 1;
+            Pass(solver, ChordStages(guess.margin * solver.tolerance)), trial(trial), guess(guess),
+            arrays(solver.arraysOf(trial, q, force)) {
     }
     void prepare(const Part& part) const {
         solver.guess(trial, guess, part.first, part.end);
     }
     void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
         solver.guess(trial, guess, batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
-        share.addError(batch.solvePositions(arrays, begin, end, iteration, share.iterations));
+        share.addError(batch.solvePositions(arrays, begin, end, stages, share.iterations));
     }
     void runFree(int particle) const {
         solver.moveFreeParticle(arrays, particle);
     }
-    void move(int stage, const Part& part) const {
-        solver.moveParticles(trial, part, stage > 0); // there is at least one update
-    }
-    double form(int, const Part& part) const {
-        return system.evaluate(trial.positions, trial.parameters, solver.correction, solver.jacobian, part);
-    }
-    bool isLast(int stage, double error, double previous) const {
-        return iteration.isOver(stage, error, previous);
-    }
-    bool isCertain(int stage, double error) const {
-        return stage == 0 || error > iteration.aim;
-    }
-    Unknowns unknowns(int) const {
-        return {&solver.correction, nullptr};
-    }
-    void update(const Part& part) const {
-        for (int k = part.first; k < part.end; k++)
-            trial.multipliers[k] += solver.correction[k] / (trial.kick * trial.drift);
+    TrialClusters clustersOf(const Part& part) const {
+        return {solver, part, trial};
     }
     const Trial& trial;
     const Guess& guess;
     const StepArrays arrays;
-    const ChordIteration iteration;
 };
 
 // The first of two trials, and for the batches and the free particles the second as well.
@@ -156,11 +156,10 @@ struct ConstraintSolver::SecondPass : ChordPass {
     }
 };
 
-// One chord iteration with Lambda(q,p+), its only stage.
-struct ConstraintSolver::CoupledPass : Pass {
+struct ConstraintSolver::CoupledPass : Pass<CoupledStages> {
     CoupledPass(ConstraintSolver& solver, const Trial& trial, const Coupled& coupled, const Guess* guess,
                 Observer* observer) :
-            Pass(solver, observer), trial(trial), coupled(coupled), guess(guess),
+            Pass(solver, CoupledStages(), observer), trial(trial), coupled(coupled), guess(guess),
             arrays(solver.arraysOf(trial, *solver.q, solver.force->data())) {
         arrays.lambdaPlus = coupled.multipliers.data();
         arrays.rightSidePlus = coupled.rightSide.data();
@@ -173,8 +172,6 @@ struct ConstraintSolver::CoupledPass : Pass {
     }
     void prepare(const Part& part) const {
         start(part.first, part.end);
-        for (int k = part.first; k < part.end; k++)
-            trial.multipliers[k] += solver.correction[k];
     }
     void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
         start(batch.getFirstConstraint(begin), batch.getFirstConstraint(end));
@@ -183,21 +180,25 @@ struct ConstraintSolver::CoupledPass : Pass {
     void runFree(int particle) const {
         solver.moveFreeParticle(arrays, particle);
     }
-    void move(int, const Part& part) const {
-        solver.moveParticles(trial, part, true);
-    }
-    double form(int, const Part& part) const {
-        vector<double>& correction = solver.correction;
-        const double error = system.evaluate(trial.positions, trial.parameters, correction, solver.jacobian, part);
-        system.evaluateCurvature(*solver.q, trial.velocities, coupled.parameters, coupled.rightSide, part);
-        for (int k = part.first; k < part.end; k++) {
-            coupled.multipliers[k] = coupled.rightSide[k] += solver.appliedTerm[k];
-            correction[k] /= trial.kick * trial.drift;
+    struct Clusters : TrialClusters {
+        Clusters(ConstraintSolver& solver, const Part& part, const Trial& trial, const Coupled& coupled) :
+                TrialClusters(solver, part, trial), applied(solver.appliedTerm), rightSide(coupled.rightSide),
+                multipliers(coupled.multipliers), parameters(coupled.parameters) {
         }
-        return error;
-    }
-    Unknowns unknowns(int) const {
-        return {&coupled.multipliers, &solver.correction};
+        double evaluate(vector<double>& g) const {
+            const double error = TrialClusters::evaluate(g);
+            forConstraints([&](int k) { g[k] = toUpdate(g[k]); });
+            return error;
+        }
+        void evaluateCurvature(vector<double>& x) const {
+            system.evaluateCurvature(*solver.q, trial.velocities, parameters, x, part);
+        }
+        const vector<double>& applied;
+        vector<double>&rightSide, &multipliers;
+        const ExpressionParameters& parameters;
+    };
+    Clusters clustersOf(const Part& part) const {
+        return {solver, part, trial, coupled};
     }
     const Trial& trial;
     const Coupled& coupled;
@@ -205,10 +206,9 @@ struct ConstraintSolver::CoupledPass : Pass {
     StepArrays arrays;
 };
 
-// The end of a step. Stages: (3.13), and (4.3) at one or two velocities.
-struct ConstraintSolver::FinishPass : Pass {
+struct ConstraintSolver::FinishPass : Pass<FinishStages> {
     FinishPass(ConstraintSolver& solver, const OnStep& state, Observer* observer) :
-            Pass(solver, observer), state(state), half(state.atHalfStep), jacobian(solver.jacobianNext),
+            Pass(solver, FinishStages(), observer), state(state), half(state.atHalfStep),
             arrays{state.positions.data(),
                    state.halfStep.data(),
                    state.forces.data(),
@@ -220,78 +220,88 @@ struct ConstraintSolver::FinishPass : Pass {
                    state.accelerations != nullptr ? state.accelerations->data() : nullptr,
                    state.kick} {
     }
-    int numStages() const {
-        return 2;
-    }
     const ConstraintSystem::Jacobian* toFactorize() const {
-        return &jacobian;
+        return &solver.jacobianNext;
     }
     void prepare(const Part& part) const { // the joints' rows are in the columns of pieces
-        system.evaluateJacobian(state.positions, state.parameters, jacobian, part);
+        system.evaluateJacobian(state.positions, state.parameters, solver.jacobianNext, part);
     }
     void runBatch(const ClusterBatch& batch, int begin, int end, Result& share) const {
         share.addPivot(batch.finish(arrays, begin, end));
     }
+    struct Clusters : ConstraintSolver::Clusters {
+        Clusters(ConstraintSolver& solver, const Part& part, const OnStep& state) :
+                ConstraintSolver::Clusters(solver, part, solver.jacobianNext), state(state), kick(state.kick),
+                hasHalfStep(state.atHalfStep != nullptr), hasNetAccelerations(state.accelerations != nullptr),
+                w(state.halfStep), v(state.velocities),
+                netAccelerations(hasNetAccelerations ? *state.accelerations : v), applied(solver.appliedTermNext),
+                rightSide(state.rightSide), multipliers(state.multipliers),
+                halfRightSide(hasHalfStep ? state.atHalfStep->rightSide : rightSide),
+                halfMultipliers(hasHalfStep ? state.atHalfStep->multipliers : multipliers) {
+        }
+        Vec3 getAcceleration(int i) const {
+            const Vec3 result = state.forces[i] * system.getInverseMasses()[i];
+            if (hasNetAccelerations)
+                netAccelerations[i] = result; // the constraints' are added in the end
+            return result;
+        }
+        void multiplyAccelerations(vector<double>& x) const {
+            system.multiplyOverMass(jacobian, state.forces, x, part);
+        }
+        void addParameterMotion(vector<double>& x) const {
+            system.addParameterMotion(state.positions, state.parameters, x, part);
+        }
+        void evaluateCurvature(const Vectors& velocities, vector<double>& x) const {
+            system.evaluateCurvature(state.positions, velocities, state.parameters, x, part);
+        }
+        const OnStep& state;
+        const double kick;
+        const bool hasHalfStep, hasNetAccelerations;
+        const Vectors& w;
+        Vectors &v, &netAccelerations; // these if they are wanted
+        vector<double>&applied, &rightSide, &multipliers, &halfRightSide, &halfMultipliers; // likewise
+    };
+    Clusters clustersOf(const Part& part) const {
+        return {solver, part, state};
+    }
     void runFree(int i) const {
-        const Vec3 acceleration = state.forces[i] * system.getInverseMasses()[i];
-        state.velocities[i] = state.halfStep[i] + acceleration * state.kick;
-        if (state.accelerations != nullptr)
-            (*state.accelerations)[i] = acceleration;
-    }
-    void move(int stage, const Part& part) const {
-        const vector<int>& particles = system.getGeneralParticles();
-        if (stage == 0) // (3.12)
-            for (int p = part.firstParticle; p < part.endParticle; p++)
-                runFree(particles[p]);
-        else
-            system.addTransposedOverMass(jacobian, solver.correction, -1.0, state.velocities, part);
-    }
-    double form(int stage, const Part& part) const {
-        if (stage == 0) { // (3.13)
-            system.multiply(jacobian, state.velocities, solver.correction, part);
-            system.addParameterMotion(state.positions, state.parameters, solver.correction, part);
-        }
-        else { // K Lambda = g''(v,v) + G M^-1 F (4.3), at the on-step and the half-step velocities
-            system.multiplyOverMass(jacobian, state.forces, solver.appliedTermNext, part);
-            formMultiplierEquation(state.velocities, state.rightSide, state.multipliers, part);
-            if (half != nullptr)
-                formMultiplierEquation(state.halfStep, half->rightSide, half->multipliers, part);
-        }
-        return 0;
-    }
-    void formMultiplierEquation(const Vectors& velocities, vector<double>& rightSide, vector<double>& multipliers,
-                                const Part& part) const {
-        system.evaluateCurvature(state.positions, velocities, state.parameters, rightSide, part);
-        for (int k = part.first; k < part.end; k++)
-            multipliers[k] = rightSide[k] += solver.appliedTermNext[k];
-    }
-    Unknowns unknowns(int stage) const {
-        if (stage == 0)
-            return {&solver.correction, nullptr};
-        return {&state.multipliers, half != nullptr ? &half->multipliers : nullptr};
-    }
-    void complete(const Part& part) const {
-        if (state.accelerations != nullptr)
-            system.addTransposedOverMass(jacobian, state.multipliers, -1.0, *state.accelerations, part);
+        Clusters one = clustersOf(ConstraintSystem::ALL);
+        FinishStages::kick(one, i);
     }
     const OnStep& state;
     HalfStep* half;
-    ConstraintSystem::Jacobian& jacobian;
     const OnStepArrays arrays;
 };
 
 template <class Each> SharedWork::Result ConstraintSolver::run(const Each& pass) {
-    work.runOnJoints([&](const CutCluster& cluster) { pass.prepare(cluster.joints); });
+    auto prepare = [&](const Part& part) {
+        pass.prepare(part);
+        auto clusters = pass.clustersOf(part);
+        pass.stages.prepare(clusters);
+    };
+    auto factorize = [&](const Part& part, Result& share) {
+        if (pass.toFactorize() != nullptr)
+            share.addFailed(matrix.tryToFactorize(*pass.toFactorize(), part));
+        return share.failed == ConstraintMatrix::REGULAR;
+    };
+    work.runOnJoints([&](const CutCluster& cluster) { prepare(cluster.joints); });
     Result result = work.run(
         [&](int block) { pass.seeBlock(block); },
         [&](const ClusterBatch& batch, int begin, int end, Result& share) { pass.runBatch(batch, begin, end, share); },
         [&](int particle) { pass.runFree(particle); },
-        [&](const Part& part, Result& share) { runWhole(pass, part, share); },
+        [&](const Part& part, Result& share) {
+            prepare(part);
+            if (!factorize(part, share))
+                return;
+            auto clusters = pass.clustersOf(part);
+            const StagesResult found = runStages(pass.stages, clusters);
+            pass.seePart(part);
+            share.addIterations(found.stage);
+            share.addError(found.error);
+        },
         [&](const Part& piece, Result& share) {
-            pass.prepare(piece);
-            if (pass.toFactorize() != nullptr)
-                share.addFailed(matrix.tryToFactorize(*pass.toFactorize(), piece));
-            if (share.failed == ConstraintMatrix::REGULAR)
+            prepare(piece);
+            if (factorize(piece, share))
                 share.addPieceError(beginStage(pass, 0, piece));
         });
     if (!system.getPieces().empty() && result.failed == ConstraintMatrix::REGULAR)
@@ -299,78 +309,62 @@ template <class Each> SharedWork::Result ConstraintSolver::run(const Each& pass)
     return result;
 }
 
-// All stages for a part of whole clusters.
-template <class Each> void ConstraintSolver::runWhole(const Each& pass, const Part& part, Result& share) {
-    pass.prepare(part);
-    if (pass.toFactorize() != nullptr) {
-        const int failed = matrix.tryToFactorize(*pass.toFactorize(), part);
-        share.addFailed(failed);
-        if (failed != ConstraintMatrix::REGULAR)
-            return;
-    }
-    double error = 0, previous = std::numeric_limits<double>::infinity();
-    for (int stage = 0; stage < pass.numStages(); stage++) {
-        pass.move(stage, part);
-        error = pass.form(stage, part);
-        if (pass.isLast(stage, error, previous)) {
-            share.addIterations(stage);
-            break;
-        }
-        previous = error;
-        pass.unknowns(stage).forEach([&](vector<double>& x, int) { matrix.solve(x, part); });
-        pass.update(part);
-    }
-    pass.complete(part);
-    pass.seePart(part);
-    share.addError(error);
-}
-
 // A piece's part of a stage, up to where it waits for its joints; returns the largest error.
 template <class Each> double ConstraintSolver::beginStage(const Each& pass, int stage, const Part& piece) {
-    pass.move(stage, piece);
-    const double error = pass.form(stage, piece);
-    isPieceEliminated[piece.piece] = pass.isCertain(stage, error);
+    auto clusters = pass.clustersOf(piece);
+    pass.stages.move(stage, clusters);
+    const double error = pass.stages.form(stage, clusters);
+    isPieceEliminated[piece.piece] = pass.stages.isCertain(stage, error);
     if (isPieceEliminated[piece.piece])
-        eliminate(pass.unknowns(stage), piece);
+        eliminate(pass, stage, piece);
     return error;
+}
+
+template <class Each> void ConstraintSolver::eliminate(const Each& pass, int stage, const Part& piece) {
+    auto clusters = pass.clustersOf(piece);
+    pass.stages.forUnknowns(stage, clusters,
+                            [&](vector<double>& x, int channel) { matrix.eliminate(x, piece, channel); });
 }
 
 // The rest for cut clusters, when all pieces have begun the first stage.
 template <class Each> void ConstraintSolver::runCut(const Each& pass, Result& result) {
     double error = result.pieceError, previous = std::numeric_limits<double>::infinity();
-    for (int stage = 0; stage < pass.numStages(); stage++) {
+    for (int stage = 0; stage < pass.stages.getCount(); stage++) {
         work.runOnJoints([&](const CutCluster& cluster) {
             if (stage == 0 && pass.toFactorize() != nullptr)
                 result.addFailed(matrix.tryToFactorizeJoints(*pass.toFactorize(), cluster));
-            error = largerOf(error, pass.form(stage, cluster.joints));
+            auto joints = pass.clustersOf(cluster.joints);
+            error = largerOf(error, pass.stages.form(stage, joints));
         });
         if (result.failed != ConstraintMatrix::REGULAR)
             return;
-        if (pass.isLast(stage, error, previous)) {
+        if (pass.stages.isLast(stage, error, previous)) {
             result.addIterations(stage);
             break;
         }
         previous = error;
-        const auto unknowns = pass.unknowns(stage);
         if (std::count(isPieceEliminated.begin(), isPieceEliminated.end(), false) > 0)
             work.runOnPieces([&](const Part& piece, Result&) {
                 if (!isPieceEliminated[piece.piece])
-                    eliminate(unknowns, piece);
+                    eliminate(pass, stage, piece);
             });
+        const bool isMore = stage + 1 < pass.stages.getCount();
         work.runOnJoints([&](const CutCluster& cluster) {
-            unknowns.forEach([&](vector<double>& x, int channel) { matrix.solveJoints(x, cluster, channel); });
-            pass.update(cluster.joints);
-            if (stage + 1 == pass.numStages())
+            auto joints = pass.clustersOf(cluster.joints);
+            pass.stages.forUnknowns(stage, joints,
+                                    [&](vector<double>& x, int channel) { matrix.solveJoints(x, cluster, channel); });
+            pass.stages.update(joints);
+            if (!isMore)
                 pass.seePart(cluster.joints);
         });
-        const bool isMore = stage + 1 < pass.numStages();
         const Result pieces = work.runOnPieces([&](const Part& piece, Result& share) {
-            unknowns.forEach([&](vector<double>& x, int) { matrix.substitute(x, piece); });
-            pass.update(piece);
+            auto clusters = pass.clustersOf(piece);
+            pass.stages.forUnknowns(stage, clusters, [&](vector<double>& x, int) { matrix.substitute(x, piece); });
+            pass.stages.update(clusters);
             if (isMore)
                 share.addError(beginStage(pass, stage + 1, piece));
             else {
-                pass.complete(piece);
+                pass.stages.complete(clusters);
                 pass.seePart(piece);
             }
         });
@@ -378,10 +372,6 @@ template <class Each> void ConstraintSolver::runCut(const Each& pass, Result& re
             error = pieces.error;
     }
     result.addError(error);
-}
-
-template <class Unknowns> void ConstraintSolver::eliminate(const Unknowns& unknowns, const Part& piece) {
-    unknowns.forEach([&](vector<double>& x, int channel) { matrix.eliminate(x, piece, channel); });
 }
 
 // ------------------------------------------------------------------------------------------------------ a step from there

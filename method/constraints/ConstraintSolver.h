@@ -311,7 +311,9 @@ private:
     typedef ConstraintSystem::CutCluster CutCluster;
     typedef SharedWork::Result Result;
     enum FactorScope { NoFactor, GeneralFactor, FullFactor };
-    struct Pass;
+    struct Clusters;
+    struct TrialClusters;
+    template <class Stages> struct Pass;
     struct ChordPass;
     struct FirstPass;
     struct SecondPass;
@@ -331,10 +333,9 @@ private:
                  batches[k]->getFirstConstraint(system.getBlocks()[block + 1].clusters[k]));
     }
     template <class Each> Result run(const Each& pass);
-    template <class Each> void runWhole(const Each& pass, const Part& part, Result& share);
     template <class Each> double beginStage(const Each& pass, int stage, const Part& piece);
     template <class Each> void runCut(const Each& pass, Result& result);
-    template <class Unknowns> void eliminate(const Unknowns& unknowns, const Part& piece);
+    template <class Each> void eliminate(const Each& pass, int stage, const Part& piece);
 
     void ensureFactor(FactorScope scope);
     void ensureGeneralFactor();

@@ -7,8 +7,8 @@
 namespace OpenMMVRattle {
 
 /*
- * Some functions are compiled a second time, with all that the compiler has inlined into them (GCC: whatever they call), for processors
- * with wide vectors. The numbers are the same to the last bit, since nothing is contracted (-ffp-contract=off):
+ * Some functions are compiled a second time, with all that the compiler has inlined into them (GCC: whatever they call; Clang:
+ * what it sees fit), for processors with wide vectors. The numbers are the same to the last bit, since nothing is contracted (-ffp-contract=off):
  *
  *     OPENMMVRATTLE_WIDE void workWide(...) { work(...); }
  *
