@@ -113,20 +113,6 @@ void ConstraintSolver::findMultipliers(const Vectors& v, const ExpressionParamet
     matrix.solve(multipliers);
 }
 
-// Half of what it has more with twice the rates than with none, since it is a square function of them.
-void ConstraintSolver::findChangeWithRates(const Vectors& v, const ExpressionParameters& parameters,
-                                           vector<double>& result) const {
-    ExpressionParameters other = parameters;
-    for (double& rate : other.rates)
-        rate *= 2;
-    system.evaluateCurvature(*q, v, other, result);
-    other.isMoving = false;
-    vector<double> atRest(result.size());
-    system.evaluateCurvature(*q, v, other, atRest);
-    for (size_t k = 0; k < result.size(); k++)
-        result[k] = 0.5 * (result[k] - atRest[k]);
-}
-
 void ConstraintSolver::addProjection(const Vectors& v, const ExpressionParameters& parameters, Vectors& result) {
     ensureFactor(FullFactor);
     system.multiply(jacobian, v, correction);
@@ -138,22 +124,6 @@ void ConstraintSolver::addProjection(const Vectors& v, const ExpressionParameter
 void ConstraintSolver::addTransposedOverMass(const vector<double>& x, double scale, Vectors& result) {
     ensureFactor(FullFactor);
     system.addTransposedOverMass(jacobian, x, scale, result);
-}
-
-void ConstraintSolver::multiplyOverMass(const Vectors& f, vector<double>& result) {
-    ensureFactor(FullFactor);
-    system.multiplyOverMass(jacobian, f, result);
-}
-
-void ConstraintSolver::solveMatrix(vector<double>& x) {
-    ensureFactor(FullFactor);
-    matrix.solve(x);
-}
-
-void ConstraintSolver::addVelocityJacobianTransposed(const Vectors& v, const ExpressionParameters& parameters,
-                                                     const vector<double>& x, Vectors& result) {
-    system.evaluateVelocityJacobian(*q, v, parameters, velocityJacobian);
-    system.addTransposed(velocityJacobian, x, result);
 }
 
 // Multipliers are differences of accelerations; compare with the size of what cancels, in the multipliers' unit.
@@ -243,11 +213,6 @@ bool ConstraintSolver::linearize(const Trial& trial) {
 void ConstraintSolver::findUpdate(const Trial& trial, vector<double>& x) {
     x = residual;
     solveLinearized(x, trial.kick * trial.drift);
-}
-
-void ConstraintSolver::findResponse(const Trial& trial, const Vectors& dq, vector<double>& x) {
-    system.multiply(jacobianNext, dq, x);
-    solveLinearized(x, -trial.kick * trial.drift);
 }
 
 void ConstraintSolver::solveLinearized(vector<double>& x, double scale) const {

@@ -170,17 +170,8 @@ public:
     void projectVelocities(Vectors& v) {
         addProjection(v, ExpressionParameters(), v);
     }
-    /** How K Lambda changes with the logarithm of the rates dtheta/dt, all of which grow by the same factor. */
-    void findChangeWithRates(const Vectors& v, const ExpressionParameters& theta, std::vector<double>& result) const;
     /** result += scale M^-1 G^T x */
     void addTransposedOverMass(const std::vector<double>& x, double scale, Vectors& result);
-    /** result = G M^-1 f */
-    void multiplyOverMass(const Vectors& f, std::vector<double>& result);
-    /** x = K^-1 x */
-    void solveMatrix(std::vector<double>& x);
-    /** result += G(v)^T x, G(v) being the matrix with the rows (d^2g/dq^2 v)^T */
-    void addVelocityJacobianTransposed(const Vectors& v, const ExpressionParameters& theta,
-                                       const std::vector<double>& x, Vectors& result);
     /** The size that multipliers have by rounding alone, in users' units or, if they are weighted by masses, as M^(-1/2) G^T Lambda. */
     double findMultiplierRounding(bool isMassWeighted, const Vectors& v, double acceleration);
 
@@ -256,8 +247,6 @@ public:
     bool linearize(const Trial& trial);
     /** x = -A^-1 g */
     void findUpdate(const Trial& trial, std::vector<double>& x);
-    /** x = A^-1 G(q+) dq */
-    void findResponse(const Trial& trial, const Vectors& dq, std::vector<double>& x);
 
     // --------------------------------------------------------------------------------------------------------- its end
 

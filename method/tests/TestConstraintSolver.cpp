@@ -171,14 +171,7 @@ struct Pair {
 void testAtPositions(Pair& p) {
     ASSERT(p.largestError(p.q) <= TOLERANCE);
     const int m = p.system.getNumConstraints();
-    vector<double> x(m), product(m), right(m);
-    for (int c = 0; c < m; c++)
-        x[c] = std::sin(1.0 + c);
-    const Vector b = numbers(x);
-    p.solver.solveMatrix(x);
-    assertNear(b, p.k * numbers(x), 1e-9);
-    p.solver.multiplyOverMass(p.force, product);
-    assertNear(p.g * (p.inverseMasses * flatten(p.force)), numbers(product), 1e-12);
+    vector<double> x(m), right(m);
     p.solver.findMultipliers(p.e.velocities, p.theta, x, right);
     assertNear(p.multipliers(p.e.velocities), numbers(x), 1e-6);
     assertNear(p.k * numbers(x), numbers(right), 1e-9);
@@ -233,7 +226,7 @@ void testCoupledPasses(Pair& p) {
 void testNewton(Pair& p) {
     const int m = p.system.getNumConstraints();
     Vectors q = p.q, w = p.e.velocities;
-    vector<double> lambda(m, 0.0), update(m), response(m), values(m);
+    vector<double> lambda(m, 0.0), update(m), values(m);
     const double kick = 1e-3, drift = 2e-3;
     const ConstraintSolver::Trial trial = {p.e.velocities, kick, drift, p.theta, q, w, lambda};
     ASSERT(p.solver.evaluate(trial) > TOLERANCE);
@@ -245,9 +238,6 @@ void testNewton(Pair& p) {
     p.system.evaluateJacobian(q, p.theta, rows);
     p.system.evaluate(q, p.theta, values, rows);
     ASSERT((a * numbers(update) + numbers(values)).norm() <= 1e-9 * numbers(values).norm());
-    p.solver.findResponse(trial, p.e.velocities, response);
-    const Vector right = next * p.moving(p.e.velocities);
-    ASSERT((a * numbers(response) - right).norm() <= 1e-9 * right.norm());
 }
 
 void testFinish(Pair& p) {
