@@ -5,6 +5,7 @@
 // said where that fails too.
 
 #include "Examples.h"
+#include "Steps.h"
 #include "TestSupport.h"
 #include "constraints/NewtonMatrix.h"
 #include "run/VRattleRun.h"
