@@ -5,6 +5,7 @@
 #include "openmm/common/ContextSelector.h"
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 using namespace OpenMMVRattle;
 using OpenMM::ComputeKernel;
@@ -513,17 +514,54 @@ ExpressionParameters DeviceSteps::getParameters() {
     return expressions ? expressions->getParameters(stepSizeRead) : ExpressionParameters();
 }
 
+// OpenMM lets molecules that are alike change places on the device, and their constraints with them.
+const vector<int>& DeviceSteps::findConstraintsInPlace() {
+    const vector<int>& order = context.getAtomIndex();
+    if (order == constraintOrder)
+        return constraintInPlace;
+    // Two constraints of the same particles are told apart by their order, which is that of all molecules that are alike.
+    typedef std::pair<vector<int>, int> Place;
+    std::map<vector<int>, vector<int>> numbers;
+    vector<Place> places;
+    for (const ClusterKind& kind : layout.kinds)
+        for (int c = 0; c < (kind.getNumConstraints() > 0 ? kind.getNumClusters() : 0); c++)
+            for (int k = 0; k < kind.getNumConstraints(); k++) {
+                vector<int> particles;
+                for (int i : kind.particlesOf[k])
+                    particles.push_back(kind.getParticle(c, i));
+                std::sort(particles.begin(), particles.end());
+                numbers[particles].push_back(kind.getConstraint(c, k));
+                places.emplace_back(particles, kind.getConstraint(c, k));
+            }
+    for (auto& same : numbers)
+        std::sort(same.second.begin(), same.second.end());
+    constraintInPlace.resize(layout.distances.size() + (expressions ? expressions->getClusters().getRows().size() : 0));
+    std::iota(constraintInPlace.begin(), constraintInPlace.end(), 0);
+    for (const Place& place : places) {
+        const vector<int>& here = numbers.at(place.first);
+        vector<int> particles;
+        for (int i : place.first)
+            particles.push_back(order[i]);
+        std::sort(particles.begin(), particles.end());
+        constraintInPlace[place.second] =
+            numbers.at(particles).at(std::lower_bound(here.begin(), here.end(), place.second) - here.begin());
+    }
+    constraintOrder = order;
+    return constraintInPlace;
+}
+
 vector<double> DeviceSteps::getMultipliers() {
     OpenMM::ContextSelector selector(context);
+    const vector<int>& inPlace = findConstraintsInPlace();
     const int numDistances = (int) layout.distances.size();
-    vector<double> result(numDistances + (expressions ? expressions->getClusters().getRows().size() : 0));
+    vector<double> result(inPlace.size());
     auto take = [&](OpenMM::ComputeArray& array, const vector<int>& constraints) {
         if (constraints.empty())
             return;
         vector<double> found;
         array.download(found, true);
         for (size_t i = 0; i < constraints.size(); i++)
-            result[constraints[i]] = found[i] * (constraints[i] < numDistances ? 0.5 : 1.0);
+            result[inPlace[constraints[i]]] = found[i] * (constraints[i] < numDistances ? 0.5 : 1.0);
     };
     take(multipliers, smallConstraints);
     take(largeMultipliers, large.getConstraints());
@@ -534,7 +572,13 @@ vector<double> DeviceSteps::getMultipliers() {
 
 vector<double> DeviceSteps::getExpressionMultipliers() {
     OpenMM::ContextSelector selector(context);
-    return expressions->getMultipliers();
+    const vector<int>& inPlace = findConstraintsInPlace();
+    const int numDistances = (int) layout.distances.size();
+    const vector<double> found = expressions->getMultipliers();
+    vector<double> result(found.size());
+    for (size_t i = 0; i < found.size(); i++)
+        result[inPlace[numDistances + i] - numDistances] = found[i];
+    return result;
 }
 
 bool DeviceSteps::begin(const State& state, double energy, const ExpressionParameters* theta) {

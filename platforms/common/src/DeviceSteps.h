@@ -156,6 +156,7 @@ public:
     }
 
 private:
+    const std::vector<int>& findConstraintsInPlace();
     struct Kernels {
         ExpressionSteps::Kernels expressions;
         OpenMM::ComputeKernel finish, evaluate, trial, advance, restore;
@@ -203,6 +204,8 @@ private:
     unsigned numLargeLaunches;
     long long numLaunches;
     std::vector<int> smallConstraints; // as they were given, in the order of lengths and multipliers
+    // Which constraint, as given, is that of the molecule now in the place of another's; for that order of the atoms.
+    std::vector<int> constraintInPlace, constraintOrder;
     int half; // the control block that is in force
     int stepNumber; // of the last advance()
     int numTrials; // launches for a density

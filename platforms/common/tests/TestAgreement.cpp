@@ -489,6 +489,15 @@ void testExpressionsInABox() {
     }
     ASSERT(largestDifference(t.positions, there.positions()) > 1.5 * t.edge);
     ASSERT(largestDifference(there.positions(), here.positions()) <= choose(1e-8, 1e-3, 1e-1));
+    vector<double> expected = there.integrator.getMultipliers(), found = here.integrator.getMultipliers();
+    const int numDistances = t.system.getNumConstraints();
+    for (size_t k = 0; k < expected.size(); k++) {
+        const double allowed = choose(1e-5, 1e-2, 1e-1) * largestOf(expected);
+        ASSERT(std::fabs(found[k] - expected[k]) <= allowed);
+        const int expression = (int) k - numDistances;
+        if (expression >= 0)
+            ASSERT(std::fabs(here.integrator.getExpressionConstraintMultiplier(expression) - expected[k]) <= allowed);
+    }
     // Other lengths for molecules that were identical: what follows knows which is which.
     for (On* each : {&here, &there}) {
         for (int i : {2, 9})
