@@ -22,8 +22,8 @@ const double REGULAR_MARGIN = 0.1, ON_STEP_MARGIN = 1e-4;
 // The density equation (3.14) is solved to the tolerance of the constraints, but not closer than rounding of U allows; and
 // where strained, badly scaled constraints make that rounding larger, the second number counts.
 const double DENSITY_ROUNDING = 1e-12, STRAINED_DENSITY_ROUNDING = 1e-8;
-// In the search for a density: the slopes of (3.14) that are believed, and the factor that it may change by in a trial.
-const double SMALLEST_SLOPE = 0.1, LARGEST_FACTOR = 4;
+// In the search for a density: the slopes of (3.14) that are believed, and the factors that it may change by in a trial and grow by in all.
+const double SMALLEST_SLOPE = 0.1, LARGEST_FACTOR = 4, FARTHEST = 100;
 
 } // namespace
 
@@ -134,6 +134,7 @@ bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equat
 bool StepSolver::searchDensity(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext) {
     const double infinity = std::numeric_limits<double>::infinity();
     rhoNext = equation.explicitValue > 0 ? equation.explicitValue : equation.fallBack;
+    const double farthest = FARTHEST * rhoNext;
     double low = 0, high = infinity; // F < 0 and F > 0
     double lastDensity = 0, lastMismatch = -infinity, slope = 1 + 0.5 * h * equation.rate / (rhoNext * rhoNext);
     bool isSolved = false;
@@ -160,8 +161,10 @@ bool StepSolver::searchDensity(StepMonitor& monitor, const DensityEquation& equa
         lastMismatch = mismatch;
         if (!(aim > low && aim < high))
             aim = 0.5 * (low + high);
-        // Far away (3.14) has solutions of no meaning.
         rhoNext = std::min(std::max(aim, rhoNext / LARGEST_FACTOR), rhoNext * LARGEST_FACTOR);
+        // Where the step size is far too large there are solutions of no meaning.
+        if (rhoNext > farthest)
+            return false;
     }
     return false;
 }
