@@ -27,7 +27,7 @@ public:
     /** A part has about so many constraints, or one cluster. */
     static const int PART_SIZE = 128;
     /** There is room for so many numbers of each particle, which are added up over its cluster. */
-    static const int NUM_TERMS = 6;
+    static constexpr int NUM_TERMS = 6;
 
     ExpressionClusters(const ClusterLayout& layout, const std::vector<ExpressionConstraint>& expressions);
     /**

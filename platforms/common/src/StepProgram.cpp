@@ -22,7 +22,7 @@ namespace {
 
 const int MANY_ENTRIES = 16; // of the matrix of Newton's iteration
 const int MOST_IN_REGISTERS = 6; // constraints; of more the distance vectors are in local memory
-const int MAX_ITERATIONS = 20, LARGEST_POWER = 64, NUM_AUTOMATIC_TERMS = 6;
+const int MAX_ITERATIONS = 20, LARGEST_POWER = 64;
 // Of a part with expressions: where so many chord iterations do not converge Newton's follow.
 const int MAX_CHORD_ITERATIONS = 12, MAX_PART_ITERATIONS = 100;
 // Of a group that waits for others, about 0.2 s; they come within microseconds.
@@ -149,7 +149,7 @@ StepProgram::StepProgram(const ClusterLayout& layout, const LargeClusters& large
     writeMonitors(terms);
     if (areShared && update == Automatic)
         // A piece leaves those of its cluster, and of how many pieces that is.
-        numSums = std::max(numSums, NUM_AUTOMATIC_TERMS + 1);
+        numSums = std::max(numSums, ExpressionClusters::NUM_TERMS + 1);
     const int bytesOfGroup = getGroupSize(areShared) * (isMixed ? 8 : 4); // for one number of each thread
     const int numKept = writeClusters(findSmallKinds(layout), large.getLocalMemory() / bytesOfGroup);
     writeLargeClusters(large, numKept * bytesOfGroup);
@@ -442,7 +442,7 @@ void StepProgram::writeAutomaticControl(int numPieces) {
     text = DeviceSources::automatic;
     replaceAll(text, "AUTOMATIC_RECURSIONS", DeviceSources::AutomaticRecursions);
     const map<string, int> numbers = {{"NUM_PIECES", numPieces},
-                                      {"NUM_TERMS", NUM_AUTOMATIC_TERMS},
+                                      {"NUM_TERMS", ExpressionClusters::NUM_TERMS},
                                       {"NUM_CHOICES", Control::NumAutomaticChoices},
                                       {"NUM_NUMBERS", Control::NumAutomaticNumbers},
                                       {"FIRST_REFERENCE", Control::FirstReference},
