@@ -16,9 +16,9 @@ IntegratorSettings::IntegratorSettings(double size) {
     terms.push_back({StepMonitor::ConstraintMultipliers, 1.0, 1.0, 0.0});
 }
 
-IntegratorSettings::IntegratorSettings(double size, const LangevinSettings& settings) :
-        isDefaultMonitor(false), langevin(settings) {
+IntegratorSettings::IntegratorSettings(double size, const LangevinSettings& settings) : isDefaultMonitor(false) {
     stepSize = size;
+    langevin = settings;
 }
 
 bool IntegratorSettings::usesMonitorForceGroup() const {

@@ -5,9 +5,7 @@
 #define OPENMMVRATTLE_INTEGRATORSETTINGS_H_
 
 #include "expressions/ExpressionGroup.h"
-#include "step/LangevinSettings.h"
 #include "step/StepSettings.h"
-#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -24,9 +22,6 @@ struct IntegratorSettings : StepSettings {
     bool isDefaultMonitor = true; // nobody has chosen it, so it is made to fit the System
     int monitorForceGroup = 31;
     double normOrder = DEFAULT_NORM_ORDER; // of monitors that are added without one
-
-    // Constant temperature, in place of all that varies the step.
-    std::optional<LangevinSettings> langevin;
 
     std::vector<ExpressionConstraint> expressions;
 

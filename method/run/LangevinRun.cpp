@@ -9,10 +9,6 @@ using namespace OpenMMVRattle;
 using OpenMM::Vec3;
 using std::vector;
 
-void LangevinRun::setSettings(const IntegratorSettings& from) {
-    LangevinDynamics::setSettings({from.stepSize, from.tolerance, *from.langevin});
-}
-
 void LangevinRun::beginFixedSteps(double) {
     throw std::logic_error("this method has no trial runs");
 }

@@ -17,7 +17,6 @@ struct IntegratorSettings;
 class LangevinRun : public LangevinDynamics {
 public:
     using LangevinDynamics::LangevinDynamics;
-    void setSettings(const IntegratorSettings& integrator);
     /** Automatic step control and trial runs are not of this method. */
     double getNegligibleValue() const {
         return 0;

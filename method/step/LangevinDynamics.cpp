@@ -45,6 +45,7 @@ LangevinDynamics::LangevinDynamics(const vector<double>& masses, const vector<Di
         solver(masses, constraints, expressions), motion(solver.getSystem()), clusterForces(solver), groupEnergy(0),
         values(1, 0.0), reference(0), lastSubstep(0), seed(0), numDrawn(0), numSubstepped(0), largestSubsteps(1),
         isInProgress(false), isAtStart(false), doublings(0), substep(0), systemSize(0) {
+    settings.langevin.emplace();
     for (vector<double>* numbers : {&lambda, &lambdaNow, &lambdaNext, &multipliers, &noMultipliers, &rightSide})
         numbers->resize(getConstraintSystem().getNumConstraints());
     noForce.resize(getConstraintSystem().getNumParticles());
@@ -68,19 +69,19 @@ void LangevinDynamics::setParallel(const Parallel& parallel, int numThreads) {
 }
 
 void LangevinDynamics::setSettings(const Settings& newSettings) {
-    if (newSettings.langevin.randomSeed != settings.langevin.randomSeed || seed == 0) {
-        seed = newSettings.langevin.randomSeed;
+    if (newSettings.langevin->randomSeed != settings.langevin->randomSeed || seed == 0) {
+        seed = newSettings.langevin->randomSeed;
         while (seed == 0)
             seed = osrngseed();
-        seed += (int64_t) newSettings.langevin.randomStream << 32;
+        seed += (int64_t) newSettings.langevin->randomStream << 32;
         numDrawn = 0;
     }
     const bool isStepNew = newSettings.stepSize != settings.stepSize;
     settings = newSettings;
     solver.setTolerance(settings.tolerance);
-    if (settings.langevin.reference > 0)
-        reference = settings.langevin.reference;
-    else if (reference > 0 && !settings.langevin.isReferenceFrozen) {
+    if (settings.langevin->reference > 0)
+        reference = settings.langevin->reference;
+    else if (reference > 0 && !settings.langevin->isReferenceFrozen) {
         // The floor of smaller steps is no reference for large ones, which would be blind until it has fallen.
         if (isStepNew)
             reference = std::min(reference, std::max(LARGEST_START * findFloor(), values[0]));
@@ -94,7 +95,7 @@ void LangevinDynamics::setRandomState(const vector<double>& state) {
 }
 
 void LangevinDynamics::setReferences(const vector<double>& references) {
-    if (settings.langevin.reference == 0)
+    if (settings.langevin->reference == 0)
         reference = references.at(0);
 }
 
@@ -103,7 +104,7 @@ void LangevinDynamics::setReferences(const vector<double>& references) {
 // In thermal motion each A_c is as large as its number of particles N_c, and U as S = (sum_c N_c^4)^(1/8): 24 for a protein of 580 atoms
 // that is one cluster, 2 for eight rigid waters, times what a particle has for itself.
 double LangevinDynamics::findFloor(double coldest) const {
-    const double kT = BOLTZMANN * std::max(settings.langevin.temperature, coldest);
+    const double kT = BOLTZMANN * std::max(settings.langevin->temperature, coldest);
     return settings.stepSize > 0 ? std::max(FLOOR, FLOOR_PART * systemSize) * std::sqrt(kT) / settings.stepSize : 0.0;
 }
 
@@ -113,7 +114,7 @@ void LangevinDynamics::startReference() {
 }
 
 double LangevinDynamics::getFollowingFactor() const {
-    return settings.langevin.reference > 0 || settings.langevin.isReferenceFrozen ? 1.0 : std::exp(FOLLOWING_RATE);
+    return settings.langevin->reference > 0 || settings.langevin->isReferenceFrozen ? 1.0 : std::exp(FOLLOWING_RATE);
 }
 
 // A running median. The heat of a clash must not teach it what is calm: where it leaves by less than the rate in a step, through a low
@@ -133,7 +134,7 @@ double LangevinDynamics::findFloor() const {
 }
 
 double LangevinDynamics::findLargestCalm() const {
-    return settings.langevin.maxDoublings > 0 ? std::pow(TRIGGER, 1 / POWER) : std::numeric_limits<double>::max();
+    return settings.langevin->maxDoublings > 0 ? std::pow(TRIGGER, 1 / POWER) : std::numeric_limits<double>::max();
 }
 
 // k, without its bound.
@@ -336,8 +337,8 @@ double LangevinDynamics::computeHalfStepKineticEnergy() {
 // ---------------------------------------------------------------------------------------------------------- a step
 
 LangevinDynamics::Noise LangevinDynamics::findNoise() const {
-    const double damping = settings.langevin.friction * settings.stepSize;
-    const double kT = BOLTZMANN * settings.langevin.temperature;
+    const double damping = settings.langevin->friction * settings.stepSize;
+    const double kT = BOLTZMANN * settings.langevin->temperature;
     return {std::exp(-damping), std::sqrt(-kT * std::expm1(-2 * damping))};
 }
 
@@ -365,7 +366,7 @@ double LangevinDynamics::step(double) {
         solver.beginStep();
         startReference();
         motion.prepare(q, theta);
-        doublings = std::min(findDoublings(values[0]), settings.langevin.maxDoublings);
+        doublings = std::min(findDoublings(values[0]), settings.langevin->maxDoublings);
         startAttempt();
     }
     std::string reason;
@@ -386,7 +387,7 @@ void LangevinDynamics::startAttempt() {
 
 // The attempt has failed.
 void LangevinDynamics::raise(const std::string& reason) {
-    if (doublings == settings.langevin.maxDoublings) {
+    if (doublings == settings.langevin->maxDoublings) {
         evaluateMonitorOfState();
         const auto hardest = std::max_element(clusterSums.begin(), clusterSums.end());
         std::stringstream message;
@@ -503,7 +504,7 @@ bool LangevinDynamics::finish(Vectors& forces, double energy) {
             raise("the monitor U became infinite or not a number");
         return false;
     }
-    if (doublings < settings.langevin.maxDoublings && findDoublings(u) > doublings) {
+    if (doublings < settings.langevin->maxDoublings && findDoublings(u) > doublings) {
         raise("");
         return false;
     }

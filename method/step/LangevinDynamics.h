@@ -8,7 +8,7 @@
 #include "constraints/ParameterMotion.h"
 #include "openmm/Vec3.h"
 #include "step/ClusterForces.h"
-#include "step/LangevinSettings.h"
+#include "step/StepSettings.h"
 #include <cstdint>
 #include <functional>
 #include <map>
@@ -48,10 +48,7 @@ namespace OpenMMVRattle {
 class LangevinDynamics {
 public:
     typedef ConstraintSolver::Parallel Parallel;
-    struct Settings {
-        double stepSize = 0, tolerance = 1e-8; // H (ps); of the constraints, relative
-        LangevinSettings langevin;
-    };
+    typedef StepSettings Settings;
     /** What the next step depends on beside the settings, positions, velocities and forces; saved for a restart. */
     struct Memory {
         std::vector<double> parameters, parameterRates; // theta[n], and dtheta/dt of the step to it
@@ -65,6 +62,7 @@ public:
     template <class Task> void share(int count, const Task& task) {
         solver.share(count, task);
     }
+    /** Take over settings: the step size, here H, the tolerance of the constraints and those of Langevin dynamics, which there must be. */
     void setSettings(const Settings& newSettings);
     const Settings& getSettings() const {
         return settings;

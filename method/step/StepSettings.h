@@ -5,13 +5,15 @@
 #define OPENMMVRATTLE_STEPSETTINGS_H_
 
 #include "step/AutomaticControl.h"
+#include "step/LangevinSettings.h"
 #include "step/StepDensity.h"
 #include "step/StepMonitor.h"
+#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
 
-/** What a user can choose of variable steps. */
+/** What a user can choose of steps, variable ones or those of Langevin dynamics: all that a method takes, as one value. */
 struct StepSettings {
     static constexpr double USE_DEFAULT = -1;
 
@@ -27,6 +29,8 @@ struct StepSettings {
     double automaticReferences[AutomaticControl::NUM_MONITORS] = {};
     int automaticRequest = 0; // changes when references in force are to be forgotten
     int calibrationSteps = 1; // how many steps the references are found from
+    // Constant temperature, in place of all that varies the step.
+    std::optional<LangevinSettings> langevin = {};
 
     /** The bounds in force (ps), 0 for none. */
     double getMinimumStep() const {

@@ -49,11 +49,12 @@ Vectors forceAt(const Vectors& positions) {
 
 LangevinDynamics::Settings makeSettings() {
     LangevinDynamics::Settings settings;
+    settings.langevin.emplace();
     settings.stepSize = 0.004;
     settings.tolerance = 1e-12;
-    settings.langevin.temperature = 300;
-    settings.langevin.friction = 5;
-    settings.langevin.randomSeed = 17;
+    settings.langevin->temperature = 300;
+    settings.langevin->friction = 5;
+    settings.langevin->randomSeed = 17;
     return settings;
 }
 
@@ -147,7 +148,7 @@ struct PlainStep {
               const Vectors& velocities, const Vectors& noise, int k, bool projectsAlways) : q(start), v(velocities) {
         const DenseSolver solver{e};
         const int substeps = LangevinSettings::getSubsteps(k);
-        const double d = settings.stepSize / substeps, damping = settings.langevin.friction * settings.stepSize;
+        const double d = settings.stepSize / substeps, damping = settings.langevin->friction * settings.stepSize;
         const double a = std::exp(-damping);
         auto project = [&](bool isNeeded) {
             if (isNeeded || projectsAlways)
@@ -168,7 +169,7 @@ struct PlainStep {
                 before = v;
                 for (size_t p = 0; p < q.size(); p++)
                     v[p] = v[p] * a +
-                           noise[p] * std::sqrt(BOLTZMANN * settings.langevin.temperature * (1 - a * a) / e.masses[p]);
+                           noise[p] * std::sqrt(BOLTZMANN * settings.langevin->temperature * (1 - a * a) / e.masses[p]);
                 after = v;
                 project(false);
                 drift(0.5 * d);
@@ -198,10 +199,10 @@ void testRetracesSteps() {
         Example e = makeExample();
         LangevinDynamics dynamics = makeDynamics(e);
         LangevinDynamics::Settings settings = makeSettings();
-        settings.langevin.maxDoublings = k;
+        settings.langevin->maxDoublings = k;
         dynamics.setSettings(settings);
         begin(dynamics, e);
-        settings.langevin.reference =
+        settings.langevin->reference =
             1e-6 * dynamics.getMonitorValues()[0]; // so that k is k_max, forwards and backwards
         dynamics.setSettings(settings);
         const Vectors start = dynamics.getPositions(), velocities = dynamics.getVelocities();
@@ -213,8 +214,8 @@ void testRetracesSteps() {
         ASSERT(largestDistance(plain.v, dynamics.getVelocities()) < 1e-10);
         ASSERT(largestDistance(start, dynamics.getPositions()) > 1e-3);
 
-        const double damping = settings.langevin.friction * settings.stepSize;
-        const double scale = std::sqrt(BOLTZMANN * settings.langevin.temperature * -std::expm1(-2 * damping));
+        const double damping = settings.langevin->friction * settings.stepSize;
+        const double scale = std::sqrt(BOLTZMANN * settings.langevin->temperature * -std::expm1(-2 * damping));
         Vectors back(noise.size());
         for (size_t i = 0; i < back.size(); i++)
             back[i] = (plain.after[i] * std::exp(-damping) - plain.before[i]) * (std::sqrt(e.masses[i]) / scale);
@@ -232,8 +233,8 @@ void testNeedsOneProjection() {
         Example e = makeExample();
         LangevinDynamics dynamics = makeDynamics(e);
         LangevinDynamics::Settings settings = makeSettings();
-        settings.langevin.maxDoublings = k;
-        settings.langevin.reference = 1e-6;
+        settings.langevin->maxDoublings = k;
+        settings.langevin->reference = 1e-6;
         dynamics.setSettings(settings);
         begin(dynamics, e);
         for (int i = 0; i < 5; i++) {
@@ -254,12 +255,12 @@ void testTriesAgainWithTheSameNoise() {
         Example e = makeExample();
         LangevinDynamics dynamics = makeDynamics(e);
         LangevinDynamics::Settings settings = makeSettings();
-        settings.langevin.randomSeed = seed;
-        settings.langevin.friction = 200; // so that the noise decides about the end of a step
-        settings.langevin.temperature = 2000;
+        settings.langevin->randomSeed = seed;
+        settings.langevin->friction = 200; // so that the noise decides about the end of a step
+        settings.langevin->temperature = 2000;
         dynamics.setSettings(settings);
         begin(dynamics, e);
-        settings.langevin.reference = referenceFor(dynamics, 1);
+        settings.langevin->reference = referenceFor(dynamics, 1);
         dynamics.setSettings(settings);
         const Vectors start = dynamics.getPositions(), velocities = dynamics.getVelocities();
         Vectors noise(start.size());
@@ -329,7 +330,7 @@ void testFailureLeavesTheState() {
     Example e = makeExample();
     LangevinDynamics dynamics = makeDynamics(e);
     LangevinDynamics::Settings settings = makeSettings();
-    settings.langevin.maxDoublings = 3;
+    settings.langevin->maxDoublings = 3;
     dynamics.setSettings(settings);
     begin(dynamics, e);
     takeStep(dynamics);
@@ -356,7 +357,7 @@ void testFailureLeavesTheState() {
     other.setSettings(settings);
     begin(other, e);
     takeStep(other);
-    settings.langevin.reference = 1e-6;
+    settings.langevin->reference = 1e-6;
     for (LangevinDynamics* each : {&dynamics, &other})
         each->setSettings(settings);
     takeStep(dynamics);
@@ -379,11 +380,11 @@ void testReference() {
         reference = std::max(floor, reference * std::exp(dynamics.getMonitorValues()[0] > reference ? 0.002 : -0.002));
         ASSERT_EQUAL_TOL(reference, dynamics.getReferences()[0], 1e-14);
     }
-    settings.langevin.isReferenceFrozen = true;
+    settings.langevin->isReferenceFrozen = true;
     dynamics.setSettings(settings);
     takeStep(dynamics);
     ASSERT_EQUAL_TOL(reference, dynamics.getReferences()[0], 1e-14);
-    settings.langevin.reference = 7;
+    settings.langevin->reference = 7;
     dynamics.setSettings(settings);
     takeStep(dynamics);
     ASSERT_EQUAL(7.0, dynamics.getReferences()[0]);
@@ -398,7 +399,7 @@ void testHeatDoesNotCaptureTheReference() {
         LangevinDynamics::Settings settings = makeSettings();
         settings.stepSize = 0.001;
         settings.tolerance = 1e-8;
-        settings.langevin.temperature = temperature;
+        settings.langevin->temperature = temperature;
         dynamics.setSettings(settings);
         begin(dynamics, e);
         takeStep(dynamics);

@@ -11,14 +11,11 @@ bool CommonLangevinDevice::canGoOnDevice() {
 }
 
 DeviceSteps::Settings CommonLangevinDevice::makeDeviceSettings() {
-    const LangevinDynamics::Settings& from = method.getSettings();
     const LangevinDynamics::Noise noise = method.findNoise();
     const double factor = method.getFollowingFactor();
-    DeviceSteps::Settings settings = {from.stepSize,         StepDensity(StepDensity::Explicit, from.stepSize, 0, 0),
-                                      StepDensity::Explicit, true,
-                                      from.tolerance,        {}};
-    settings.langevin = DeviceSteps::Langevin{noise.damping, noise.size, factor > 1 ? method.findFloor() : 0.0, factor,
-                                              method.findLargestCalm()};
+    DeviceSteps::Settings settings = {method.getSettings()};
+    settings.atTemperature = {noise.damping, noise.size, factor > 1 ? method.findFloor() : 0.0, factor,
+                              method.findLargestCalm()};
     return settings;
 }
 

@@ -25,20 +25,17 @@ bool CommonVRattleDevice::canGoOnDevice() {
 }
 
 DeviceSteps::Settings CommonVRattleDevice::makeDeviceSettings() {
-    const StepSettings& settings = method.getSettings();
-    DeviceSteps::Settings to = {settings.stepSize,    settings.getDensity(), settings.update,
-                                settings.isFixedStep, settings.tolerance,    {}};
-    to.isAutomatic = settings.isAutomatic;
+    DeviceSteps::Settings settings = {method.getSettings()};
     if (settings.isAutomatic) {
-        to.choice = method.getAutomaticControl().getChoice();
-        to.numDegreesOfFreedom = method.getAutomaticControl().getNumDegreesOfFreedom();
-        return to;
+        settings.terms.clear();
+        settings.choice = method.getAutomaticControl().getChoice();
+        settings.numDegreesOfFreedom = method.getAutomaticControl().getNumDegreesOfFreedom();
+        return settings;
     }
-    to.terms = settings.terms;
     const vector<double> references = method.getReferences();
-    for (size_t k = 0; k < to.terms.size(); k++)
-        to.terms[k].reference = references[k];
-    return to;
+    for (size_t k = 0; k < settings.terms.size(); k++)
+        settings.terms[k].reference = references[k];
+    return settings;
 }
 
 DeviceSteps::State CommonVRattleDevice::makeDeviceState() {

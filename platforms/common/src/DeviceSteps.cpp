@@ -176,20 +176,21 @@ void DeviceSteps::setSettings(const Settings& newSettings) {
         settings.terms = {{StepMonitor::ConstraintAndAppliedForce, 1, 1, 1}}; // stands for its own monitor
     compile();
     vector<double> numbers(program->getNumSettings());
+    const StepDensity density = settings.getDensity();
     numbers[Control::Nominal] = settings.stepSize;
-    numbers[Control::Smallest] = settings.density.smallest;
-    numbers[Control::Lower] = settings.density.lower;
-    numbers[Control::Slope] = settings.density.upperSlope;
-    numbers[Control::Curve] = settings.density.curve;
+    numbers[Control::Smallest] = density.smallest;
+    numbers[Control::Lower] = density.lower;
+    numbers[Control::Slope] = density.upperSlope;
+    numbers[Control::Curve] = density.curve;
     numbers[Control::DensityTolerance] =
         std::max(MARGIN * settings.tolerance, isMixed ? DENSITY_TOLERANCE : SINGLE_DENSITY_TOLERANCE);
     numbers[Control::DensityRounding] = isMixed ? DENSITY_ROUNDING : SINGLE_DENSITY_ROUNDING;
     if (isLangevin()) {
-        numbers[Control::Damping] = settings.langevin->damping;
-        numbers[Control::NoiseSize] = settings.langevin->noise;
-        numbers[Control::ReferenceFloor] = settings.langevin->floor;
-        numbers[Control::Following] = settings.langevin->growth;
-        numbers[Control::LargestCalm] = settings.langevin->largestCalm;
+        numbers[Control::Damping] = settings.atTemperature.damping;
+        numbers[Control::NoiseSize] = settings.atTemperature.noise;
+        numbers[Control::ReferenceFloor] = settings.atTemperature.floor;
+        numbers[Control::Following] = settings.atTemperature.growth;
+        numbers[Control::LargestCalm] = settings.atTemperature.largestCalm;
     }
     for (size_t k = 0; k < settings.terms.size(); k++) {
         numbers[Control::FirstTerm + 3 * k] = settings.terms[k].weight;

@@ -10,10 +10,10 @@
 #include "StepProgram.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
+#include "step/StepSettings.h"
 #include <cstdint>
 #include <map>
 #include <memory>
-#include <optional>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -29,23 +29,18 @@ namespace OpenMMVRattle {
  */
 class DeviceSteps {
 public:
+    /** The numbers that Langevin dynamics goes by. */
     struct Langevin {
         double damping, noise; // a and sqrt(kT (1 - a^2))
         double floor, growth;  // U_ref is no less, and follows U by this factor
         double largestCalm;    // steps that end with a larger U/U_ref need substeps
     };
-    struct Settings {
-        double stepSize;
-        StepDensity density;
-        StepDensity::Update update;
-        bool isFixedStep;
-        double tolerance;
-        std::vector<StepMonitor::Term> terms; // with the references in force; of no use to Langevin dynamics
-        /** With automatic step control, in place of density, update and monitors: its choices, and the degrees of freedom. */
-        bool isAutomatic = false;
+    /** What has been chosen, with the references in force among the monitors, and what the method on the host makes of it. */
+    struct Settings : StepSettings {
+        /** With automatic step control: its choices, and the degrees of freedom. */
         AutomaticRecursions::AutomaticChoice choice = {};
         double numDegreesOfFreedom = 1;
-        std::optional<Langevin> langevin = {};
+        Langevin atTemperature = {};
     };
     /** What of the state is in the control block. */
     struct State {

@@ -241,10 +241,8 @@ struct Both {
         const double energy = groupEnergyAt(dynamics.getPositions());
         computeForces();
         context.setVelocities(dynamics.getVelocities());
+        DeviceSteps::Settings to = {settings};
         if (settings.isAutomatic) {
-            DeviceSteps::Settings to = {
-                settings.stepSize, StepDensity(), settings.update, false, settings.tolerance, {}};
-            to.isAutomatic = true;
             to.choice = dynamics.getAutomaticControl().getChoice();
             to.numDegreesOfFreedom = dynamics.getAutomaticControl().getNumDegreesOfFreedom();
             device.setSettings(to);
@@ -253,12 +251,9 @@ struct Both {
             ASSERT(device.begin(state, energy));
             return;
         }
-        vector<StepMonitor::Term> terms = settings.terms;
-        for (size_t k = 0; k < terms.size(); k++)
-            terms[k].reference = memory.references[k];
-        device.setSettings({settings.stepSize,
-                            StepDensity(settings.update, settings.stepSize, settings.minimumStep, settings.maximumStep),
-                            settings.update, false, settings.tolerance, terms});
+        for (size_t k = 0; k < to.terms.size(); k++)
+            to.terms[k].reference = memory.references[k];
+        device.setSettings(to);
         const ExpressionParameters theta = getHostParameters();
         ASSERT(device.begin({memory.rho, memory.densityOffset, memory.hasHalfStepValue, memory.halfStepValue}, energy,
                             &theta));
@@ -856,7 +851,10 @@ void testDependentConstraints(const std::string& precision) {
     Context context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}});
     const ClusterLayout layout = molecules.findLayout();
     DeviceSteps device(lender.getDevice(), layout);
-    device.setSettings({0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-6, {}});
+    StepSettings settings;
+    settings.stepSize = 0.001;
+    settings.tolerance = 1e-6;
+    device.setSettings({settings});
     context.setPositions(molecules.positions);
     context.setVelocities(molecules.velocities);
     lender.getContext().calcForcesAndEnergy(true, false, 1);
@@ -975,8 +973,7 @@ void testFailureLeavesTheStateBefore(const std::string& precision, int length = 
         both.context.setPositions(both.dynamics.getPositions());
         both.context.setVelocities(both.dynamics.getVelocities());
         both.computeForces();
-        both.device.setSettings(
-            {0.001, StepDensity(StepDensity::Explicit, 0.001, 0, 0), StepDensity::Explicit, true, 1e-5, {}});
+        both.device.setSettings({both.settings});
         ASSERT(both.device.begin({1, 0, false, 0}, 0));
         for (int i = 0; i < (attempt == 0 ? 30 : 60); i++)
             both.stepOnDevice();
@@ -1204,18 +1201,20 @@ struct BothLangevin {
     Context context;
     LangevinDynamics dynamics;
     DeviceSteps device;
-    const double stepSize = 0.001, tolerance;
+    const double stepSize = 0.001;
 
     BothLangevin(const Molecules& molecules, const std::string& precision) :
             context(molecules.system, lender, OpenMM::Platform::getPlatform("OpenCL"), {{"Precision", precision}}),
             dynamics(molecules.masses, molecules.constraints, molecules.expressions),
-            device(lender.getDevice(), dynamics.getConstraintSystem().getLayout(), molecules.expressions),
-            tolerance(DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12)) {
-        LangevinSettings langevin;
-        langevin.temperature = 300;
-        langevin.friction = 5;
-        langevin.randomSeed = -123456789;
-        dynamics.setSettings({stepSize, tolerance, langevin});
+            device(lender.getDevice(), dynamics.getConstraintSystem().getLayout(), molecules.expressions) {
+        StepSettings settings;
+        settings.stepSize = stepSize;
+        settings.tolerance = DeviceSteps::tolerableTolerance(lender.getDevice(), 1e-12);
+        settings.langevin.emplace();
+        settings.langevin->temperature = 300;
+        settings.langevin->friction = 5;
+        settings.langevin->randomSeed = -123456789;
+        dynamics.setSettings(settings);
         dynamics.begin(molecules.positions, molecules.velocities, forcesAt(molecules.positions), 0);
         dynamics.setRandomState({-123456789, 4294967290.0}); // whose lower word is soon over
     }
@@ -1238,10 +1237,9 @@ struct BothLangevin {
     }
     // Let the device go on from a state with the host's random numbers, a and sqrt(kT (1 - a^2)) being given.
     void begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const LangevinDynamics::Noise& noise) {
-        DeviceSteps::Settings settings = {
-            stepSize, StepDensity(StepDensity::Explicit, stepSize, 0, 0), StepDensity::Explicit, true, tolerance, {}};
-        settings.langevin = DeviceSteps::Langevin{noise.damping, noise.size, dynamics.findFloor(),
-                                                  dynamics.getFollowingFactor(), dynamics.findLargestCalm()};
+        DeviceSteps::Settings settings = {dynamics.getSettings()};
+        settings.atTemperature = {noise.damping, noise.size, dynamics.findFloor(), dynamics.getFollowingFactor(),
+                                  dynamics.findLargestCalm()};
         forcesAt(positions);
         context.setVelocities(velocities);
         device.setSettings(settings);
