@@ -18,6 +18,17 @@ inline std::string listParticles(const std::vector<int>& particles, size_t maxLi
     return particles.size() > maxListed ? text + ", ... (" + std::to_string(particles.size()) + " in all)" : text;
 }
 
+/** Do something, and undo it where it fails, whatever it throws. */
+template <class Action, class Undo> void attempt(const Action& action, const Undo& undo) {
+    try {
+        action();
+    }
+    catch (...) {
+        undo();
+        throw;
+    }
+}
+
 /** A step, or the start of a run, could not be completed. The state before it is untouched. */
 class StepFailure : public std::runtime_error {
 public:

@@ -5,6 +5,7 @@
 #define OPENMMVRATTLE_CONTEXTVECTORS_H_
 
 #include "openmm/Vec3.h"
+#include <functional>
 #include <map>
 #include <string>
 #include <vector>
@@ -24,14 +25,17 @@ public:
     virtual const Vectors& getVelocities() = 0;
     /** Of the last evaluation, to be read once: whoever does may take the storage and leave other in its place. */
     virtual Vectors& getForces() = 0;
-    virtual void setPositions(const Vectors& positions) = 0;
-    virtual void setVelocities(const Vectors& velocities) = 0;
-    /** Where positions and velocities may be written in place, or null if they are elsewhere. */
-    virtual Vectors* accessPositions() {
-        return nullptr;
-    }
-    virtual Vectors* accessVelocities() {
-        return nullptr;
+    /** Writes some of the vectors that it is given, and leaves the others as they are. */
+    typedef std::function<void(Vectors&)> Writer;
+    /**
+     * Have positions or velocities written, in place if they are vectors of the host and else in a copy that takes their place.
+     *
+     * @param areAll    each of them is written, so that it is of no interest what they were
+     */
+    virtual void writePositions(const Writer& write, bool areAll) = 0;
+    virtual void writeVelocities(const Writer& write, bool areAll) = 0;
+    void setPositions(const Vectors& positions) {
+        writePositions([&](Vectors& to) { to = positions; }, true);
     }
     /** The three periodic box vectors. */
     virtual const OpenMM::Vec3* getBoxVectors() = 0;

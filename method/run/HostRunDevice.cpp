@@ -66,22 +66,18 @@ vector<DistanceConstraint> constraintsOf(const System& system) {
 std::unique_ptr<RunDevice> OpenMMVRattle::makeHostRunDevice(std::unique_ptr<ContextVectors> vectors,
                                                             const System& system, const IntegratorSettings& settings,
                                                             const SharedWork::Parallel& parallel, int numThreads) {
-    auto make = [&](auto device) -> std::unique_ptr<RunDevice> {
-        if (parallel)
-            device->setParallel(parallel, numThreads);
-        return device;
-    };
     if (settings.langevin)
-        return make(std::make_unique<HostRunDevice<LangevinRun>>(std::move(vectors), system, settings));
-    return make(std::make_unique<HostRunDevice<VRattleRun>>(std::move(vectors), system, settings));
+        return std::make_unique<HostRunDevice<LangevinRun>>(std::move(vectors), system, settings, parallel, numThreads);
+    return std::make_unique<HostRunDevice<VRattleRun>>(std::move(vectors), system, settings, parallel, numThreads);
 }
 
 template <class Method>
 HostRunDevice<Method>::HostRunDevice(std::unique_ptr<ContextVectors> vectors, const System& system,
-                                     const IntegratorSettings& settings) :
+                                     const IntegratorSettings& settings, const SharedWork::Parallel& parallel,
+                                     int numThreads) :
         vectors(std::move(vectors)), system(system), masses(massesOf(system)), expressions(settings.expressions),
-        method(masses, constraintsOf(system), expressions), forceGroups(0), monitorForceGroup(ContextVectors::NO_GROUP),
-        lastStep{0.0, 1.0}, numForceEvaluations(0) {
+        method(masses, constraintsOf(system), expressions) {
+    method.setParallel(parallel, numThreads);
     hasMassless = std::any_of(masses.begin(), masses.end(), [](double mass) { return mass == 0; });
     for (int i = 0; i < system.getNumForces(); i++)
         reach.add(system.getForce(i));
@@ -112,68 +108,75 @@ template <class Method> bool HostRunDevice<Method>::setParameters(const vector<E
 
 // ------------------------------------------------------------------------------------------ what happens to the Context
 
-template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
+// Whether the periodic box is another one than when this was asked before.
+template <class Method> bool HostRunDevice<Method>::isOtherBox() {
     const Vec3* box = vectors->getBoxVectors();
-    const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
+    const bool isOther = !std::equal(boxVectors, boxVectors + 3, box);
     std::copy(box, box + 3, boxVectors);
-    if (isOtherBox || method.getPositions().empty())
+    return isOther;
+}
+
+template <class Method> RunDevice::Change HostRunDevice<Method>::findChange() {
+    if (isOtherBox() || method.getPositions().empty())
         return Change::Box;
     // A look at all positions and velocities is spent only where it may find something: where a Force may have changed them, or
     // another integrator (of a CompoundIntegrator) may have taken steps.
-    const bool mustCompare = ahead || vectors->isSharedByIntegrators();
-    if ((mustCompare || reach.isUnknown || reach.hasBarostat) && differ(vectors->getPositions(), knownPositions()))
+    const bool mayHaveMoved = ahead || vectors->isSharedByIntegrators() || reach.isUnknown || reach.hasBarostat;
+    if (mayHaveMoved && differ(vectors->getPositions(), ahead ? ahead->positions : method.getPositions()))
         return Change::State;
-    if ((mustCompare || reach.isUnknown || reach.hasBarostat || reach.hasThermostat || reach.movesFrame) &&
-        differ(vectors->getVelocities(), knownVelocities()))
+    if ((mayHaveMoved || reach.hasThermostat || reach.movesFrame) &&
+        differ(vectors->getVelocities(), ahead ? ahead->velocities : method.getVelocities()))
         return Change::Velocities;
     return Change::None;
 }
 
 template <class Method> void HostRunDevice<Method>::start() {
-    const Vectors before = vectors->getPositions();
-    const std::function<void()> putBackMethod = method.remember();
-    try {
+    auto putBack = [&, before = vectors->getPositions(), putBackMethod = method.remember()] {
+        vectors->setPositions(before);
+        putBackMethod();
+    };
+    auto start = [&] {
         method.adoptParameters();
         requireSoundStart(
             system, method.getConstraintSystem(),
             {vectors->getPositions(), vectors->getVelocities(), vectors->getBoxVectors(), method.getParameters()});
         vectors->computeVirtualSites(); // setPositions() leaves them where the user puts them
         vectors->requirePositions();
-        Vectors positions = vectors->getPositions(), forces;
-        method.projectPositions(positions);
-        const double energy = computeForcesAt(positions, forces);
-        method.begin(positions, vectors->getVelocities(), forces, energy);
-    }
-    catch (...) {
-        vectors->setPositions(before);
-        putBackMethod();
-        throw;
-    }
-    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
+        takeContext(true);
+    };
+    attempt(start, putBack);
 }
 
-template <class Method> void HostRunDevice<Method>::changeState() {
+// Go on from the Context's state, moved onto the constraints.
+template <class Method> void HostRunDevice<Method>::takeContext(bool isStart) {
     Vectors positions = vectors->getPositions(), forces;
-    method.projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint
+    method.projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint either
     const double energy = computeForcesAt(positions, forces);
-    method.changeState(positions, vectors->getVelocities(), forces, energy);
-    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
+    if (isStart)
+        method.begin(positions, vectors->getVelocities(), forces, energy);
+    else
+        method.changeState(positions, vectors->getVelocities(), forces, energy);
+    noteContext();
 }
 
 template <class Method> void HostRunDevice<Method>::changeVelocities() {
-    const bool isFrame = method.changeFrame(knownVelocities(), vectors->getVelocities());
-    if (isFrame && ahead) // somebody has looked between the start and the step
-        ahead->velocities = vectors->getVelocities();
-    if (isFrame)
-        return;
-    method.changeVelocities(vectors->getVelocities());
-    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
+    const bool isFrame =
+        method.changeFrame(ahead ? ahead->velocities : method.getVelocities(), vectors->getVelocities());
+    if (!isFrame)
+        method.changeVelocities(vectors->getVelocities());
+    if (!isFrame || ahead)
+        noteContext();
 }
 
 template <class Method> void HostRunDevice<Method>::writeVelocities() {
-    writeMovingVelocities(method.getVelocities());
+    vectors->writeVelocities(writerOf(method.getVelocities()), !hasMassless);
     if (ahead)
-        ahead->velocities = vectors->getVelocities();
+        noteContext();
+}
+
+// The Context is not in the method's state, and this is what is known of it.
+template <class Method> void HostRunDevice<Method>::noteContext() {
+    ahead = Ahead{vectors->getPositions(), vectors->getVelocities()};
 }
 
 template <class Method> void HostRunDevice<Method>::changeForces() {
@@ -185,23 +188,17 @@ template <class Method> void HostRunDevice<Method>::changeForces() {
 // The forces at positions that may not be those of the Context, which keeps its own; returns the energy of the monitor's group.
 template <class Method> double HostRunDevice<Method>::computeForcesAt(const Vectors& positions, Vectors& forces) {
     const bool isElsewhere = differ(vectors->getPositions(), positions);
-    const Vectors before = isElsewhere ? vectors->getPositions() : Vectors();
-    auto putBack = [&] {
+    double energy = 0;
+    auto putBack = [&, before = isElsewhere ? vectors->getPositions() : Vectors()] {
         if (isElsewhere)
             vectors->setPositions(before);
     };
-    double energy;
-    try {
-        if (isElsewhere) {
-            writeMovingPositions(positions);
-            vectors->computeVirtualSites();
-        }
+    auto compute = [&] {
+        if (isElsewhere)
+            moveContext(positions);
         energy = computeForces();
-    }
-    catch (...) {
-        putBack();
-        throw;
-    }
+    };
+    attempt(compute, putBack);
     forces = vectors->getForces();
     putBack();
     return energy;
@@ -211,14 +208,6 @@ template <class Method> double HostRunDevice<Method>::computeForces() {
     const double energy = vectors->computeForces(forceGroups, monitorForceGroup);
     numForceEvaluations++;
     return energy;
-}
-
-template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownPositions() const {
-    return ahead ? ahead->positions : method.getPositions();
-}
-
-template <class Method> const vector<Vec3>& HostRunDevice<Method>::knownVelocities() const {
-    return ahead ? ahead->velocities : method.getVelocities();
 }
 
 // Whether two sets of positions or velocities are others than their digits explain, for the particles that move. Those of mass zero
@@ -234,40 +223,24 @@ template <class Method> bool HostRunDevice<Method>::differ(const Vectors& a, con
     return !areSame;
 }
 
-template <class Method> void HostRunDevice<Method>::writeMovingPositions(const Vectors& positions) {
-    if (Vectors* storage = vectors->accessPositions())
-        copyMoving(positions, *storage);
-    else if (!hasMassless)
-        vectors->setPositions(positions);
-    else {
-        Vectors all = vectors->getPositions();
-        copyMoving(positions, all);
-        vectors->setPositions(all);
-    }
+template <class Method> void HostRunDevice<Method>::moveContext(const Vectors& positions) {
+    vectors->writePositions(writerOf(positions), !hasMassless);
+    vectors->computeVirtualSites();
 }
 
-template <class Method> void HostRunDevice<Method>::writeMovingVelocities(const Vectors& velocities) {
-    if (Vectors* storage = vectors->accessVelocities())
-        copyMoving(velocities, *storage);
-    else if (!hasMassless)
-        vectors->setVelocities(velocities);
-    else {
-        Vectors all = vectors->getVelocities();
-        copyMoving(velocities, all);
-        vectors->setVelocities(all);
-    }
-}
-
-template <class Method> void HostRunDevice<Method>::copyMoving(const Vectors& from, Vectors& to) {
-    method.share((int) masses.size(), [&](int first, int end) {
-        if (!hasMassless) {
-            std::copy(from.begin() + first, from.begin() + end, to.begin() + first);
-            return;
-        }
-        for (int i = first; i < end; i++)
-            if (masses[i] > 0)
-                to[i] = from[i];
-    });
+// Writes those of the particles that move, on all threads.
+template <class Method> ContextVectors::Writer HostRunDevice<Method>::writerOf(const Vectors& from) {
+    return [&](Vectors& to) {
+        method.share((int) masses.size(), [&](int first, int end) {
+            if (!hasMassless) {
+                std::copy(from.begin() + first, from.begin() + end, to.begin() + first);
+                return;
+            }
+            for (int i = first; i < end; i++)
+                if (masses[i] > 0)
+                    to[i] = from[i];
+        });
+    };
 }
 
 // ----------------------------------------------------------------------------------------------------------- the steps
@@ -278,8 +251,7 @@ template <class Method> double HostRunDevice<Method>::advance(double maxTime) {
     while (true) {
         const double size = method.step(maxStep);
         vectors->setTime(size < maxStep ? time + size : maxTime);
-        writeMovingPositions(method.getNextPositions());
-        vectors->computeVirtualSites();
+        moveContext(method.getNextPositions());
         const double energy = computeForces();
         if (method.finish(vectors->getForces(), energy))
             return size;
@@ -287,65 +259,58 @@ template <class Method> double HostRunDevice<Method>::advance(double maxTime) {
 }
 
 template <class Method> void HostRunDevice<Method>::step(double maxTime) {
-    const double time = vectors->getTime();
-    const long long count = vectors->getStepCount();
-    try {
-        vectors->setStepCount(count + 1);
-        lastStep.size = advance(maxTime);
-    }
-    catch (...) {
+    auto putBackAll = [&, time = vectors->getTime(), count = vectors->getStepCount()] {
         vectors->setTime(time);
         vectors->setStepCount(count);
         method.abandonStep();
         putBack();
-        throw;
-    }
+    };
+    auto take = [&] {
+        vectors->setStepCount(vectors->getStepCount() + 1);
+        lastStep.size = advance(maxTime);
+    };
+    attempt(take, putBackAll);
     lastStep.density = method.getDensity();
-    writeMovingVelocities(method.getVelocities());
     ahead.reset();
+    HostRunDevice::writeVelocities();
 }
 
 // The positions of the Context before a step.
 template <class Method> void HostRunDevice<Method>::putBack() {
-    if (ahead) {
+    if (ahead)
         vectors->setPositions(ahead->positions);
-        return;
-    }
-    writeMovingPositions(method.getPositions());
-    vectors->computeVirtualSites();
+    else
+        moveContext(method.getPositions());
 }
 
 template <class Method> void HostRunDevice<Method>::reverse() {
     method.reverse();
     lastStep.density = method.getDensity();
-    Vectors velocities = vectors->getVelocities();
-    for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] > 0)
-            velocities[i] *= -1;
-    vectors->setVelocities(velocities);
+    auto turnAround = [&](Vectors& velocities) {
+        for (size_t i = 0; i < masses.size(); i++)
+            if (masses[i] > 0)
+                velocities[i] *= -1;
+    };
+    vectors->writeVelocities(turnAround, false);
     if (ahead)
-        ahead->velocities = velocities;
+        noteContext();
 }
 
 template <class Method>
 void HostRunDevice<Method>::tryOut(double stepSize, int count, const std::function<void(const vector<double>&)>& look) {
-    const double time = vectors->getTime();
-    auto end = [&, putBackMethod = method.remember()] {
+    auto end = [&, time = vectors->getTime(), putBackMethod = method.remember()] {
         putBackMethod();
         vectors->setTime(time);
         putBack();
     };
-    try {
+    auto takeSteps = [&] {
         method.beginFixedSteps(stepSize);
         for (int i = 0; i < count; i++) {
             advance(std::numeric_limits<double>::infinity());
             look(method.getMonitorValues());
         }
-    }
-    catch (...) {
-        end();
-        throw;
-    }
+    };
+    attempt(takeSteps, end);
     end();
 }
 

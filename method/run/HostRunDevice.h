@@ -33,13 +33,12 @@ namespace OpenMMVRattle {
  */
 template <class Method> class HostRunDevice : public RunDevice {
 public:
-    /** @param system    must live as long as this */
+    /**
+     * @param system      must live as long as this
+     * @param parallel    runs a task on so many threads, which share the work where that is faster
+     */
     HostRunDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
-                  const IntegratorSettings& settings);
-    /** Let threads share the work where that is faster. */
-    void setParallel(const SharedWork::Parallel& parallel, int numThreads) {
-        method.setParallel(parallel, numThreads);
-    }
+                  const IntegratorSettings& settings, const SharedWork::Parallel& parallel = {}, int numThreads = 1);
     void setSettings(const IntegratorSettings& settings) override;
     bool setParameters(const std::vector<ExpressionConstraint>& given) override;
     Findings getFindings() override {
@@ -59,13 +58,13 @@ public:
         return fingerprintOf(vectors->getParameters());
     }
     void start() override;
-    void changeState() override;
+    void changeState() override {
+        takeContext(false);
+    }
     void changeVelocities() override;
     void writeVelocities() override;
     void changeForces() override;
     void step(double maxTime) override;
-    void settle() override {
-    }
     void reverse() override;
     void tryOut(double stepSize, int count, const std::function<void(const std::vector<double>&)>& look) override;
     LastStep getLastStep() override {
@@ -113,38 +112,34 @@ protected:
     double computeForcesAt(const Vectors& positions, Vectors& forces);
     double advance(double maxTime);
     void putBack();
-    const Vectors& knownPositions() const;
-    const Vectors& knownVelocities() const;
+    void takeContext(bool isStart);
+    void noteContext();
+    bool isOtherBox();
     /** How far a position that is loaded may be from the one that was saved (nm). */
     virtual double getPositionRounding() const {
         return 0;
     }
     bool differ(const Vectors& a, const Vectors& b);
-    void writeMovingPositions(const Vectors& positions);
-    void writeMovingVelocities(const Vectors& velocities);
-    void copyMoving(const Vectors& from, Vectors& to);
+    void moveContext(const Vectors& positions);
+    ContextVectors::Writer writerOf(const Vectors& from);
     std::unique_ptr<ContextVectors> vectors;
     const OpenMM::System& system;
     std::vector<double> masses;
     std::vector<ExpressionConstraint> expressions;
     Method method;
-    int forceGroups, monitorForceGroup;
+    int forceGroups = 0, monitorForceGroup = ContextVectors::NO_GROUP;
     bool hasMassless;
     ForceReach reach;
     std::optional<Ahead> ahead;
     OpenMM::Vec3 boxVectors[3]; // when they were last looked at
-    LastStep lastStep;
-    long long numForceEvaluations;
+    LastStep lastStep = {0, 1};
+    long long numForceEvaluations = 0;
 };
 
-/**
- * The device for the method that the settings ask for.
- *
- * @param parallel    runs a task on several threads; or empty
- */
+/** The device for the method that the settings ask for. */
 std::unique_ptr<RunDevice> makeHostRunDevice(std::unique_ptr<ContextVectors> vectors, const OpenMM::System& system,
-                                             const IntegratorSettings& settings,
-                                             const SharedWork::Parallel& parallel = {}, int numThreads = 1);
+                                             const IntegratorSettings& settings, const SharedWork::Parallel& parallel,
+                                             int numThreads);
 
 } // namespace OpenMMVRattle
 

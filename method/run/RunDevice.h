@@ -122,7 +122,8 @@ public:
      *
      * @throws StepFailure    if one of them could not be completed; then those after it have not happened
      */
-    virtual void settle() = 0;
+    virtual void settle() {
+    }
     /** Turn time around without computing forces: VRattleDynamics::reverse(), and the Context's velocities change sign. */
     virtual void reverse() = 0;
 

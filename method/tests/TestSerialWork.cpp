@@ -150,17 +150,11 @@ public:
     Vectors& getForces() override {
         return forces;
     }
-    void setPositions(const Vectors& x) override {
-        positions = x;
+    void writePositions(const Writer& write, bool) override {
+        write(positions);
     }
-    void setVelocities(const Vectors& v) override {
-        velocities = v;
-    }
-    Vectors* accessPositions() override {
-        return &positions;
-    }
-    Vectors* accessVelocities() override {
-        return &velocities;
+    void writeVelocities(const Writer& write, bool) override {
+        write(velocities);
     }
     const Vec3* getBoxVectors() override {
         return box;

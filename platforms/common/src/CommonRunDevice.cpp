@@ -248,11 +248,12 @@ template <class Method> void CommonRunDevice<Method>::restoreOrder() {
     compute.setPosCellOffsets(lastOffsets);
     if (!hasMassless)
         return;
-    Vectors all = vectors->getPositions();
-    for (size_t i = 0; i < masses.size(); i++)
-        if (masses[i] == 0)
-            all[i] = positions[i];
-    vectors->setPositions(all);
+    auto write = [&](Vectors& all) {
+        for (size_t i = 0; i < masses.size(); i++)
+            if (masses[i] == 0)
+                all[i] = positions[i];
+    };
+    vectors->writePositions(write, false);
 }
 
 // Take note of what has become of the steps that were asked for.
@@ -373,10 +374,7 @@ template <class Method> RunDevice::Change CommonRunDevice<Method>::findChange() 
         return Host::findChange();
     const bool mayBeOthers = haveActed;
     haveActed = false;
-    const OpenMM::Vec3* box = vectors->getBoxVectors();
-    const bool isOtherBox = !std::equal(boxVectors, boxVectors + 3, box);
-    std::copy(box, box + 3, boxVectors);
-    if (isOtherBox)
+    if (Host::isOtherBox())
         return RunDevice::Change::Box;
     // Another integrator (of a CompoundIntegrator) has taken steps.
     if (vectors->getStepCount() != knownCount)

@@ -64,7 +64,6 @@ protected:
     typedef HostRunDevice<Method> Host;
     typedef typename Host::Vectors Vectors;
     using Host::ahead;
-    using Host::boxVectors;
     using Host::expressions;
     using Host::forceGroups;
     using Host::hasMassless;

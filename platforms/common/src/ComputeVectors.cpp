@@ -42,13 +42,21 @@ ContextVectors::Vectors& ComputeVectors::getForces() {
     return forces;
 }
 
-void ComputeVectors::setPositions(const Vectors& newPositions) {
-    kernel.getAs<UpdateStateDataKernel>().setPositions(context, newPositions);
+void ComputeVectors::writePositions(const Writer& write, bool areAll) {
+    if (!areAll)
+        getPositions();
+    positions.resize(context.getSystem().getNumParticles());
+    write(positions);
+    kernel.getAs<UpdateStateDataKernel>().setPositions(context, positions);
     numWrites++;
 }
 
-void ComputeVectors::setVelocities(const Vectors& newVelocities) {
-    kernel.getAs<UpdateStateDataKernel>().setVelocities(context, newVelocities);
+void ComputeVectors::writeVelocities(const Writer& write, bool areAll) {
+    if (!areAll)
+        getVelocities();
+    velocities.resize(context.getSystem().getNumParticles());
+    write(velocities);
+    kernel.getAs<UpdateStateDataKernel>().setVelocities(context, velocities);
 }
 
 const OpenMM::Vec3* ComputeVectors::getBoxVectors() {

@@ -20,8 +20,8 @@ public:
     const Vectors& getPositions() override;
     const Vectors& getVelocities() override;
     Vectors& getForces() override;
-    void setPositions(const Vectors& positions) override;
-    void setVelocities(const Vectors& velocities) override;
+    void writePositions(const Writer& write, bool areAll) override;
+    void writeVelocities(const Writer& write, bool areAll) override;
     const OpenMM::Vec3* getBoxVectors() override;
     double getTime() override;
     void setTime(double time) override;

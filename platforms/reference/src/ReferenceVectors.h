@@ -24,17 +24,11 @@ public:
     Vectors& getForces() override {
         return *data.forces;
     }
-    void setPositions(const Vectors& positions) override {
-        *data.positions = positions;
+    void writePositions(const Writer& write, bool) override {
+        write(*data.positions);
     }
-    void setVelocities(const Vectors& velocities) override {
-        *data.velocities = velocities;
-    }
-    Vectors* accessPositions() override {
-        return data.positions;
-    }
-    Vectors* accessVelocities() override {
-        return data.velocities;
+    void writeVelocities(const Writer& write, bool) override {
+        write(*data.velocities);
     }
     const OpenMM::Vec3* getBoxVectors() override {
         return data.periodicBoxVectors;
