@@ -231,17 +231,22 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, i
         list.erase(std::unique(list.begin(), list.end()), list.end());
     };
     vector<int> order, left(size), chosen, candidates, joined;
+    vector<size_t> degrees;
     std::iota(left.begin(), left.end(), 0);
     std::for_each(neighbours.begin(), neighbours.end(), sortUnique);
     vector<int> blockedIn(size + numOuter, -1); // the round in which a neighbour has been chosen
     vector<char> isGone(size, false);
     for (int round = 0; !left.empty(); round++) {
         auto degree = [&](int row) { return neighbours[row].size(); };
-        const size_t least =
-            degree(*std::min_element(left.begin(), left.end(), [&](int a, int b) { return degree(a) < degree(b); }));
-        if (least >= (size_t) EliminationOrder::WIDE)
+        degrees.clear();
+        for (int row : left)
+            degrees.push_back(degree(row));
+        if (*std::min_element(degrees.begin(), degrees.end()) >= (size_t) EliminationOrder::WIDE)
             break;
-        const size_t most = std::max(least, FEW);
+        // Half of the rows are candidates, or what is coupled more than its ends, as a rod, would be eliminated from there alone.
+        const auto median = degrees.begin() + (degrees.size() - 1) / 2;
+        std::nth_element(degrees.begin(), median, degrees.end());
+        const size_t most = std::max(*median, FEW);
         candidates.clear();
         std::copy_if(left.begin(), left.end(), std::back_inserter(candidates),
                      [&](int row) { return degree(row) <= most; });

@@ -8,6 +8,7 @@
 #include "TestSupport.h"
 #include "constraints/ClusterLayout.h"
 #include <algorithm>
+#include <array>
 #include <set>
 
 using namespace OpenMMVRattle;
@@ -42,6 +43,34 @@ Particles makeTriples(int count) {
     return result;
 }
 
+// A rod: sections of three particles that distances keep rigid, each joined to the next by three constraints of all of their particles.
+Particles makeSections(int numSections) {
+    Particles result;
+    for (int i = 0; i < 3 * numSections; i += 3) {
+        result.insert(result.end(), {{i, i + 1}, {i, i + 2}, {i + 1, i + 2}});
+        result.insert(result.end(), i > 0 ? 3 : 0, {i - 3, i - 2, i - 1, i, i + 1, i + 2});
+    }
+    return result;
+}
+
+// A chain with the distances between next neighbours too.
+Particles makeStiffChain(int length) {
+    Particles result = {{0, 1}};
+    for (int i = 2; i <= length; i++)
+        result.insert(result.end(), {{i - 2, i}, {i - 1, i}});
+    return result;
+}
+
+// Rigid tetrahedra in a row, each with a corner of the next.
+Particles makeTetrahedra(int count) {
+    Particles result;
+    for (int i = 0; i < 3 * count; i += 3)
+        for (int j = i; j < i + 4; j++)
+            for (int k = i; k < j; k++)
+                result.push_back({k, j});
+    return result;
+}
+
 void testElimination(const Particles& particlesOf, const ClusterCut& cut, ClusterElimination::Goal goal) {
     const ClusterElimination found(particlesOf, cut, goal);
     ASSERT_EQUAL(cut.pieces.size(), found.pieces.size());
@@ -67,7 +96,13 @@ void testElimination(const Particles& particlesOf, const ClusterCut& cut, Cluste
     ASSERT_EQUAL(count, (int) levels.size());
 
     vector<vector<char>> isCoupled(count, vector<char>(count, false)), isLeft; // by the pieces
-    vector<std::set<int>> borders(found.pieces.size());
+    vector<std::set<int>> borders(
+        found.pieces.size()); // joints that have a particle of the piece, coupled to its rows or not
+    for (size_t p = 0; p < found.pieces.size(); p++)
+        for (size_t j = 0; j < found.joints.size(); j++)
+            for (int i : particlesOf[found.joints[j]])
+                if (std::count(found.pieces[p].particles.begin(), found.pieces[p].particles.end(), i) > 0)
+                    borders[p].insert((int) j);
     for (int a = 0; a < count; a++)
         for (int b = 0; b < a; b++)
             for (int i : particlesOf[order[a]])
@@ -82,8 +117,9 @@ void testElimination(const Particles& particlesOf, const ClusterCut& cut, Cluste
             for (int c = a + 1; c < count; c++)
                 if (isCoupled[c][b])
                     isCoupled[c][a] = true; // fill
-            if (a >= firstJoint && b < firstJoint)
-                borders[pieceOf[b]].insert(a - firstJoint);
+            if (a >= firstJoint && b < firstJoint) {
+                ASSERT(borders[pieceOf[b]].count(a - firstJoint) > 0);
+            }
             else {
                 ASSERT_EQUAL(pieceOf[a], pieceOf[b]); // pieces do not meet
                 ASSERT(levels[a] > levels[b]);
@@ -124,8 +160,9 @@ void testElimination(const Particles& particlesOf, const ClusterCut& cut, Cluste
 
 void testEliminations() {
     const Particles comb = makeMolecule(90, 2, 0), rings = makeMolecule(90, 2, 7), triples = makeTriples(200);
+    const Particles rod = makeSections(50), stiff = makeStiffChain(150), tetrahedra = makeTetrahedra(50);
     for (ClusterElimination::Goal goal : {ClusterElimination::LeastFill, ClusterElimination::FewLevels})
-        for (const Particles& cluster : {comb, rings, triples}) {
+        for (const Particles& cluster : {comb, rings, triples, rod, stiff, tetrahedra}) {
             testElimination(cluster, leaveWhole(cluster), goal);
             const ClusterCut cut = cutClusterAlongTree(cluster, 30);
             ASSERT(cut.pieces.size() > 3 && !cut.joints.empty());
@@ -144,6 +181,17 @@ void testEliminations() {
         count += piece.constraints.size();
     }
     ASSERT_EQUAL(chain.particlesOf.size(), count);
+    // So it is where there are more couplings, and fewer of them at the ends: a few levels more for twice the length.
+    for (Particles (*make)(int) : {makeSections, makeStiffChain, makeTetrahedra}) {
+        std::array<int, 2> levels;
+        for (int n : {0, 1}) {
+            const Particles cluster = make(n == 0 ? 500 : 1000);
+            const ClusterElimination found(cluster, leaveWhole(cluster), ClusterElimination::FewLevels);
+            ASSERT(!found.hasWideColumns && found.pieces[0].columns.rows.size() <= 12 * cluster.size());
+            levels[n] = found.pieces[0].numLevels;
+        }
+        ASSERT(levels[1] <= 40 && levels[1] <= levels[0] + 4);
+    }
     Particles star;
     for (int i = 1; i <= 60; i++)
         star.push_back({0, i});

@@ -402,6 +402,24 @@ Bonds makeStar(int numArms, int length) {
     return bonds;
 }
 
+// A chain whose next neighbours are bonded too.
+Bonds makeStiffChain(int length) {
+    Bonds bonds = makeChain(length);
+    for (int i = 2; i <= length; i++)
+        bonds.emplace_back(i - 2, i);
+    return bonds;
+}
+
+// Tetrahedra in a row, each with a corner of the next.
+Bonds makeTetrahedra(int count) {
+    Bonds bonds;
+    for (int i = 0; i < 3 * count; i += 3)
+        for (int j = i; j < i + 4; j++)
+            for (int k = i; k < j; k++)
+                bonds.emplace_back(k, j);
+    return bonds;
+}
+
 // A molecule like a protein: a backbone with side groups, each with a ring of five, and hydrogens.
 Bonds makeProtein(int numResidues) {
     Bonds bonds;
@@ -1365,9 +1383,9 @@ int main(int argc, char** argv) {
          [] { testStepsAgree(makeMolecules({makeChain(20), makeProtein(8)}), "double", UPDATES, 1e-12, 1e-9); }},
         {"large clusters in pieces agree, double",
          [] {
-             testStepsAgree(
-                 makeMolecules({makeRing(30), makeChain(400), makeRing(300), makeProtein(30), makeStar(4, 60)}),
-                 "double", UPDATES, 1e-12, 1e-9);
+             testStepsAgree(makeMolecules({makeRing(30), makeChain(400), makeRing(300), makeProtein(30),
+                                           makeStar(4, 60), makeStiffChain(150), makeTetrahedra(40)}),
+                            "double", UPDATES, 1e-12, 1e-9);
          }},
         {"large clusters in pieces agree, mixed",
          [] {
