@@ -112,9 +112,9 @@ def test_settings_are_those_of_the_plugin(chosen: dict[str, Any]) -> None:
         (lambda: Custom(0.001).getMonitorValue(), openmm.OpenMMException, "known after the first step"),
         (lambda: Custom(0.001).getMultipliers(), openmm.OpenMMException, "use VariableStepRattleIntegrator"),
         (lambda: Custom(0.001).step(1), openmm.OpenMMException, "not bound to a context"),
-        (lambda: Custom(0.001).stepTo(1), openmm.OpenMMException, "not bound to a Context"),
-        (lambda: Custom(0.001).reverse(), openmm.OpenMMException, "not bound to a Context"),
-        (lambda: Custom(0.001).calibrate(10), openmm.OpenMMException, "not bound to a Context"),
+        (lambda: Custom(0.001).stepTo(1), openmm.OpenMMException, "not bound to a context"),
+        (lambda: Custom(0.001).reverse(), openmm.OpenMMException, "not bound to a context"),
+        (lambda: Custom(0.001).calibrate(10), openmm.OpenMMException, "not bound to a context"),
         (lambda: Custom(0.001).step(1.5), TypeError, "steps must be an integer"),
         (lambda: Custom.cast(openmm.CustomIntegrator(0.001)), TypeError, "is not a CustomVariableStepRattle"),
         (lambda: Custom.cast(openmm.VerletIntegrator(0.001)), TypeError, "is not a CustomVariableStepRattle"),
@@ -658,6 +658,23 @@ def test_the_context_is_found_and_not_kept_alive() -> None:
         integrator.step(1)
 
 
+def test_a_context_that_cannot_be_found_is_asked_for() -> None:
+    """Steps without it would be without the start on the constraints, the checks, and the time of the Context."""
+    model = chain()
+    integrator = Custom(0.001)
+    context = open_context(model.system(), integrator, "Reference", model)
+    gc.freeze()
+    try:
+        with pytest.raises(openmm.OpenMMException, match="tell it with attachContext"):
+            integrator.step(1)
+        assert time_of(context) == 0
+        integrator.attachContext(context)
+        integrator.step(1)
+        assert time_of(context) == 0.001
+    finally:
+        gc.unfreeze()
+
+
 @pytest.mark.parametrize("platform, precision, bound", platform_parameters(mixed=1e-6, single=1e-4))
 def test_molecules_put_back_into_the_box_are_no_change(platform: str, precision: str, bound: float) -> None:
     """Every 250 steps a GPU sorts the particles anew and moves molecules by lengths of the box."""
@@ -702,7 +719,7 @@ def test_inside_a_compound_integrator() -> None:
     alone.step(200)
     assert variable(part, "clock") == pytest.approx(time_of(other), rel=1e-9)
     assert largest(positions_of(context) - positions_of(other)) < 1e-9
-    with pytest.raises(openmm.OpenMMException, match="not bound to a Context"):
+    with pytest.raises(openmm.OpenMMException, match="tell it with attachContext"):
         part.stepTo(1.0)
     part.attachContext(context)
     time = time_of(context)

@@ -431,7 +431,7 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         """
         steps = integer(steps, "steps")
         run = self._enter()
-        if run is None:  # there is no Context, which OpenMM says, or a CompoundIntegrator's
+        if run is None:  # a member of a CompoundIntegrator that was not told
             super().step(steps)
             return
         try:
@@ -538,9 +538,10 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
                 self.setReferenceMonitorValue(float(mean), index)
 
     def attachContext(self, context: openmm.Context) -> None:
-        """Tell the integrator its Context, where it cannot find it: as a member of a CompoundIntegrator.
+        """Tell the integrator its Context, where it cannot find it: as a member of a CompoundIntegrator, or after
+        gc.freeze(), which hides the Context. It does not look for one then.
 
-        There step(), stepTo(), reverse() and calibrate() of this object are ours, while the steps of the
+        In a CompoundIntegrator step(), stepTo(), reverse() and calibrate() of this object are ours, while the steps of the
         CompoundIntegrator are without the checks of constraints, and on the platforms Reference and CPU do not set the
         time of the Context right.
 
@@ -704,8 +705,12 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         if run is None or run.context is None:
             context = find_context(self)
             if context is None:
-                if required:
-                    raise error("this integrator is not bound to a Context")
+                super().step(0)  # raises where there is none
+                if required or self.thisown:
+                    raise error(
+                        "this integrator has a Context and cannot find it, as a member of a CompoundIntegrator cannot, "
+                        "nor any integrator after gc.freeze(): tell it with attachContext()"
+                    )
                 return None
             self.attachContext(context)
         elif not self._get("started"):  # the System may be another, by Context.reinitialize()

@@ -196,12 +196,13 @@ def _clusters(pairs: list[tuple[int, int]]) -> list[list[int]]:
 
 
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
-    """The Context that an integrator is bound to.
+    """The Context that an integrator is bound to, or None if it is not found.
 
-    In Python OpenMM tells an integrator nothing of its Context, nothing of ours is called when one is made, no method
-    of an integrator leads to it, and its program can hold numbers alone; while its platform, its time and its
-    constraints are needed from the first step on. So look for the one that refers to the integrator, once for each;
-    attachContext() does without.
+    In Python OpenMM tells an integrator nothing of its Context: Context.__init__ hands the C++ objects over and keeps
+    the integrator, and that is all. Nothing of ours is called then, no method of an integrator leads to the Context,
+    and its program can hold numbers alone; while its platform, its time and its constraints are needed from the first
+    step on. So the first step(), stepTo(), reverse() or calibrate() with a Context looks for the one that refers to
+    the integrator; later ones know it, and so do those after attachContext().
     """
     for referrer in gc.get_referrers(integrator):
         owners = [referrer] if not isinstance(referrer, dict) else gc.get_referrers(referrer)
