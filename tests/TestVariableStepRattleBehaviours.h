@@ -234,7 +234,7 @@ inline void testConstrainedMasslessParticles() {
     integrator.step(1);
     State state = context.getState(State::Positions | State::Velocities);
     for (int i = 0; i < 2; i++) {
-        ASSERT_EQUAL_VEC(Vec3(), state.getVelocities()[i], 0.0);
+        ASSERT_EQUAL_VEC(Vec3(0, 0, 0), state.getVelocities()[i], 0.0);
         ASSERT_EQUAL_VEC(Vec3(2 * i - 1, 0, 0), state.getPositions()[i], 0.0);
     }
 }

@@ -100,7 +100,7 @@ void ConstraintSystem::groupExpressions() {
     for (int k = 0; k < getNumConstraints(); k++) {
         if (!isExpression(k))
             continue;
-        const int e = givenIndex[k] - numGivenDistances, firstEntry = getNumEntries();
+        const int e = expressionOf(k), firstEntry = getNumEntries();
         const ExpressionConstraint& c = expressions[e];
         for (int i : c.particles)
             if (inverseMasses[i] > 0)
@@ -194,8 +194,7 @@ void ConstraintSystem::findGroupRanges() {
     auto addRangesOf = [&](Part& part) {
         std::map<int, GroupRange> ranges;
         for (int r = part.firstRow; r < part.endRow; r++) {
-            const std::pair<int, int>& place =
-                placeInGroups[givenIndex[expressionRows[r].constraint] - numGivenDistances];
+            const std::pair<int, int>& place = placeInGroups[expressionOf(expressionRows[r].constraint)];
             // Constraints are in their group in internal order too.
             ranges.emplace(place.first, GroupRange{place.first, place.second, place.second}).first->second.end =
                 place.second + 1;

@@ -16,6 +16,13 @@ using std::vector;
 
 namespace {
 
+double sumSquares(const ConstraintSystem::ExpressionRow& row, const ConstraintSystem::Jacobian& jacobian) {
+    double sum = 0;
+    for (int entry = row.first; entry < row.end; entry++)
+        sum += jacobian[entry].dot(jacobian[entry]);
+    return sum;
+}
+
 // A motion that changes the gradient of an expression by this fraction of its size is too long for an iteration, and that is a
 // matter of singular geometry if it is shorter than the second fraction of the distances between the particles.
 const double STRONG_CURVATURE = 0.25, SHARPNESS = 0.1;
@@ -67,7 +74,7 @@ ExpressionParameters ConstraintSystem::fromGivenOrder(const ExpressionParameters
 }
 
 ExpressionConstraint ConstraintSystem::getExpression(int index, const ExpressionParameters& theta) const {
-    const int e = givenIndex[index] - numGivenDistances;
+    const int e = expressionOf(index);
     ExpressionConstraint result = expressions[e];
     int place = firstParameters[e];
     for (auto& parameter : result.parameters)
@@ -95,7 +102,7 @@ void ConstraintSystem::findParameterChange(const vector<Vec3>& q, const Expressi
         // A period, after which g changes as before; the mere curvature of g would make it change the other way.
         if (!(ratio < 0.5 && linearThere[row.constraint] / linear[row.constraint] > 0.5))
             continue;
-        const int e = givenIndex[row.constraint] - numGivenDistances, first = firstParameters[e];
+        const int e = expressionOf(row.constraint), first = firstParameters[e];
         for (size_t i = 0; i < expressions[e].parameters.size(); i++)
             change[first + i] *= ratio;
     }
@@ -105,7 +112,7 @@ std::string ConstraintSystem::describe(int index) const {
     if (!isExpression(index))
         return "the constrained distance between the particles " + std::to_string(constraints[index].particle1) +
                " and " + std::to_string(constraints[index].particle2);
-    const int e = givenIndex[index] - numGivenDistances;
+    const int e = expressionOf(index);
     return "expression constraint " + std::to_string(e) + " (" + expressions[e].expression + " = 0) of " +
            listParticles(expressions[e].particles);
 }
@@ -119,10 +126,7 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
                          " are at the same position, so that the distance at which a constraint holds them has no "
                          "direction; set other positions";
     }
-    const ExpressionRow& row = findRow(index);
-    double square = 0;
-    for (int entry = row.first; entry < row.end; entry++)
-        square += jacobian[entry].dot(jacobian[entry]);
+    const double square = sumSquares(findRow(index), jacobian);
     if (square > 0 && std::isfinite(square))
         return "";
     return "the gradient of " + describe(index) +
@@ -134,14 +138,12 @@ std::string ConstraintSystem::explainGradient(int index, const Jacobian& jacobia
 }
 
 std::string ConstraintSystem::explainResolution(int index, const vector<Vec3>& q, double tolerance) const {
-    const DistanceConstraint& c = constraints[index];
     double largest = 0;
-    for (int i : isExpression(index) ? expressions[givenIndex[index] - numGivenDistances].particles
-                                     : vector<int>{c.particle1, c.particle2})
+    for (int i : getParticles(index))
         for (int axis = 0; axis < 3; axis++)
             largest = std::max(largest, std::fabs(q[i][axis]));
     const double spacing = std::numeric_limits<double>::epsilon() * largest;
-    const double length = isExpression(index) ? EXPRESSION_LENGTH : c.length;
+    const double length = isExpression(index) ? EXPRESSION_LENGTH : constraints[index].length;
     if (!(spacing > tolerance * length))
         return "";
     std::stringstream text;
@@ -174,26 +176,22 @@ std::string ConstraintSystem::explainLine(int cluster) const {
     return "";
 }
 
+vector<int> ConstraintSystem::getParticles(int index) const {
+    if (isExpression(index))
+        return expressions[expressionOf(index)].particles;
+    return {constraints[index].particle1, constraints[index].particle2};
+}
+
 vector<int> ConstraintSystem::getClusterParticles(int cluster) const {
     std::set<int> particles;
-    for (int k = clusters[cluster].first; k < clusters[cluster].first + clusters[cluster].size; k++) {
-        if (isExpression(k)) {
-            const vector<int>& members = expressions[givenIndex[k] - numGivenDistances].particles;
-            particles.insert(members.begin(), members.end());
-        }
-        else {
-            particles.insert(constraints[k].particle1);
-            particles.insert(constraints[k].particle2);
-        }
-    }
+    for (int k = clusters[cluster].first; k < clusters[cluster].first + clusters[cluster].size; k++)
+        for (int i : getParticles(k))
+            particles.insert(i);
     return vector<int>(particles.begin(), particles.end());
 }
 
 double ConstraintSystem::findErrorOf(const ExpressionRow& row, const vector<double>& g, const Jacobian& nearby) const {
-    double square = 0;
-    for (int entry = row.first; entry < row.end; entry++)
-        square += nearby[entry].dot(nearby[entry]);
-    return std::fabs(g[row.constraint]) / (std::sqrt(square) * EXPRESSION_LENGTH);
+    return std::fabs(g[row.constraint]) / (std::sqrt(sumSquares(row, nearby)) * EXPRESSION_LENGTH);
 }
 
 // Do something for each distance constraint of a part.
@@ -261,7 +259,7 @@ int ConstraintSystem::findSingular(const vector<Vec3>& q, const ExpressionParame
     int singular = NONE;
     double largest = STRONG_CURVATURE;
     for (const ExpressionRow& row : expressionRows) {
-        const vector<int>& particles = expressions[givenIndex[row.constraint] - numGivenDistances].particles;
+        const vector<int>& particles = expressions[expressionOf(row.constraint)].particles;
         const bool holdsFixed = row.end - row.first < (int) particles.size();
         Vec3 centre, shift;
         for (int i : particles) {
@@ -269,17 +267,14 @@ int ConstraintSystem::findSingular(const vector<Vec3>& q, const ExpressionParame
             if (particles.size() > 1 && !holdsFixed) // else its motion as a whole is no motion within it
                 shift += displacement[i] / (double) particles.size();
         }
-        double radius = EXPRESSION_LENGTH * EXPRESSION_LENGTH, path = 0, gradient = 0,
-               change = 0; // all of them squared
+        double radius = EXPRESSION_LENGTH * EXPRESSION_LENGTH, path = 0; // squared
         for (int entry = row.first; entry < row.end; entry++) {
             const int i = getParticleOf(entry);
             const Vec3 r = q[i] - centre, d = displacement[i] - shift;
             radius = std::max(radius, r.dot(r));
             path = std::max(path, d.dot(d));
-            gradient += jacobian[entry].dot(jacobian[entry]);
-            change += velocityJacobian[entry].dot(velocityJacobian[entry]);
         }
-        const double curvature = std::sqrt(change / gradient);
+        const double curvature = std::sqrt(sumSquares(row, velocityJacobian) / sumSquares(row, jacobian));
         // Over a length of the size of its particles' distances the gradient of any expression turns.
         const bool isSharp = !(path >= SHARPNESS * SHARPNESS * curvature * curvature * radius);
         if (std::isnan(curvature))

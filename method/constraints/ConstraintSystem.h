@@ -117,10 +117,6 @@ public:
     int getNumConstraints() const {
         return (int) constraints.size();
     }
-    /** The number of constraints of both kinds that were given to the constructor, with those that were left out. */
-    int getNumGivenConstraints() const {
-        return numGivenConstraints;
-    }
     const std::vector<double>& getMasses() const {
         return masses;
     }
@@ -341,6 +337,11 @@ private:
     template <class Task> void forGroups(const Part& part, const Task& task) const;
     template <class Copy> void forParameters(const Copy& copy) const;
     const ExpressionRow& findRow(int constraint) const;
+    /** Of a constraint that is given as an expression: its place among these, as they were given. */
+    int expressionOf(int index) const {
+        return givenIndex[index] - numGivenDistances;
+    }
+    std::vector<int> getParticles(int index) const; // of a constraint, as they were given
     void evaluateDistanceRows(const std::vector<OpenMM::Vec3>& x, Jacobian& jacobian, const Part& part) const;
     int numGivenConstraints, numGivenDistances, firstGeneral, numParts;
     std::vector<double> masses;

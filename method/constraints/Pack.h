@@ -13,7 +13,12 @@ const int PACK_SIZE = 4;
  * PACK_SIZE numbers, one of each of as many clusters, with the arithmetic of one. The library is built for the baseline instruction set,
  * so that it runs on every processor, and what is done with packs for wide registers as well (Wide.h).
  */
+#ifdef __x86_64__
+// Aligned for AVX2, whichever instruction set the code that has one on its stack is compiled for.
 typedef double Pack __attribute__((vector_size(PACK_SIZE * sizeof(double)), aligned(PACK_SIZE * sizeof(double))));
+#else
+typedef double Pack __attribute__((vector_size(PACK_SIZE * sizeof(double))));
+#endif
 
 inline Pack packOf(double x) {
     return Pack{x, x, x, x};

@@ -177,9 +177,9 @@ void testMasslessParticles() {
     assertThrows("mass is zero, 2", [] { ConstraintSystem({1, 2, 0}, {{0, 1, 1.0}, {1, 2, 1.0}}); });
     const ConstraintSystem one({0, 2, 0, 1}, {{1, 3, 1.0}, {0, 2, 1.0}});
     ASSERT_EQUAL(1, one.getNumConstraints());
-    ASSERT_EQUAL(2, one.getNumGivenConstraints());
     vector<double> multipliers;
     one.getGivenMultipliers({3.0}, multipliers);
+    ASSERT_EQUAL(2, multipliers.size());
     ASSERT_EQUAL_TOL(1.5, multipliers[0], 1e-15);
     ASSERT_EQUAL(0.0, multipliers[1]);
     // Expressions may hold a particle to it. It is never written to: a NaN from a trial stays a trial's, and threads that
