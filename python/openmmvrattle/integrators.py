@@ -425,10 +425,11 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
     useAutomaticStepControl().
 
     Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run,
-    and after each change of the state by the user or by a Force that moves particles (a barostat); one more where the
-    first step is taken with a given reference value, since that step is then taken twice; one after loading a
-    checkpoint or a State, to compare the forces with the saved ones; and the trial steps of calibrate(). A monitor
-    ForceGroupEnergy costs the energy of its group on top of each. getNumForceEvaluations() counts all.
+    and after each change of the state by the user or by a Force that moves particles (a barostat), or of the parameters
+    of a Force; one more where the first step is taken with a given reference value, since that step is then taken
+    twice; one after loading a checkpoint or a State, to compare the forces with the saved ones; and the trial steps of
+    calibrate(). A monitor ForceGroupEnergy costs the energy of its group on top of each. getNumForceEvaluations()
+    counts all.
 
     The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly
     coupled are met to the tolerance or the step fails with an exception; and the multipliers, that is the constraint
@@ -615,7 +616,8 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         """Set the nominal step size: the step taken where the monitor has its reference value.
 
         Where step bounds have been set it must lie between them when the next step is taken; the three can be set in
-        any order. In the course of a run the density is kept, so the steps change in proportion.
+        any order. In the course of a run the density is kept, so the steps change in proportion, but for what the
+        bounds say that have been set.
 
         Parameters
         ----------
@@ -669,8 +671,8 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         """Set the smallest step size the monitor can ask for.
 
         With the sum updates SemiExplicit and Explicit, rho oscillates slightly about u and steps may leave the bounds
-        by as much; where the motion is not resolved they may leave them by more. Default: 1/50 of the nominal step
-        size.
+        by as much; where the motion is not resolved they may leave them by more. With automatic step control no step is
+        ever smaller. Default: 1/50 of the nominal step size, and 1/1000 with automatic step control.
 
         Parameters
         ----------
@@ -787,7 +789,8 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         return super().getMonitorNormOrder(integer(index, "index"))
 
     def clearMonitors(self) -> None:
-        """Remove all monitors. With none the step is fixed at the nominal size: plain RATTLE (3.1-3.5)."""
+        """Remove all monitors, and end automatic step control. With none the step is fixed at the nominal size: plain
+        RATTLE (3.1-3.5)."""
         super().clearMonitors()
 
     def getNumMonitors(self) -> int:
@@ -952,7 +955,7 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         Returns
         -------
         float
-            the value in force, in the monitor's unit; 0 if none was set and no step has been taken
+            the value in force, in the monitor's unit; 0 if none was set and no step has been taken that could tell
 
         Raises
         ------
@@ -985,7 +988,8 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         super().setReferenceMonitorValue(number(value, "value"), integer(index, "index"))
 
     def calibrate(self, steps: int) -> None:
-        """Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size.
+        """Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size, or
+        of the two of automatic step control to their geometric means.
 
         The trial run starts at the current state of the Context, and everything but the reference values and the number
         of force evaluations is put back as it was.
@@ -998,7 +1002,8 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         Raises
         ------
         OpenMMException
-            if steps is not positive, there is no monitor, there is no Context, or a trial step fails
+            if steps is not positive, there is no monitor and no automatic step control, there is no Context, or a trial
+            step fails
         """
         super().calibrate(integer(steps, "steps"))
 

@@ -22,15 +22,16 @@ namespace OpenMMVRattle {
  *
  * and the size of the step is stepSize/rho. stepSize is thus the step that is taken where U has its reference value
  * U_ref (see setReferenceMonitorValue()), and B keeps the step between two bounds (see setMaximumStepSize()). The
- * default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4).
+ * default monitor is the Euclidean norm of the Lagrange multipliers of the constraints, the paper's U2 (4.4), and in a System
+ * without constraints ConstraintAndAppliedForce.
  *
  * For most uses let the integrator choose its steps without a monitor of yours: useAutomaticStepControl().
  *
  * Each step costs one evaluation of the forces, the one at its end. On top of these come: one at the start of a run, and after each
- * change of the state by the user or by a Force that moves particles (a barostat), or of the parameters of a Force; one more where the first step is taken with a given
- * reference value, since that step is then taken twice; one after loading a checkpoint or a State, to compare the forces with the
- * saved ones; and the trial steps of calibrate(). A monitor ForceGroupEnergy costs the energy of its group on top of each.
- * getNumForceEvaluations() counts all.
+ * change of the state by the user or by a Force that moves particles (a barostat), or of the parameters of a Force; one more where
+ * the first step is taken with a given reference value, since that step is then taken twice; one after loading a checkpoint or a
+ * State, to compare the forces with the saved ones; and the trial steps of calibrate(). A monitor ForceGroupEnergy costs the energy of
+ * its group on top of each. getNumForceEvaluations() counts all.
  *
  * The constraints are solved with a direct factorisation of the constraint matrix, so also bonds that are strongly coupled are met to
  * the tolerance or the step fails with an exception; and the multipliers, that is the constraint forces, can be read with
@@ -47,10 +48,9 @@ namespace OpenMMVRattle {
  * settings and everything else that the next step depends on, and loading one brings all of it back, the settings as
  * well: a run that goes on from a checkpoint is the same to the last bit on the Reference platform, and from a State to
  * rounding. At the first step after that the forces are computed once more. If they are not those of the saved run,
- * because a Force has been changed in the meantime, or if a State's positions, velocities or box vectors are not the
- * Context's, the run starts afresh with the saved reference values. States and checkpoints that were written under another integrator load
- * as well: positions, velocities, time and parameters are taken, the settings stay as they are, and the run starts
- * afresh.
+ * because a Force has been changed in the meantime, or if a State's positions, velocities, box vectors or parameters are not the
+ * Context's, the run starts afresh with the saved reference values. States and checkpoints that were written under another integrator
+ * load as well: positions, velocities, time and parameters are taken, the settings stay as they are, and the run starts afresh.
  *
  * Drude particles are refused, for they need an integrator that keeps them at their energy minimum or at a temperature
  * of their own, such as OpenMM's DrudeSCFIntegrator and DrudeNoseHooverIntegrator. Ring polymers (RPMD) are the matter
@@ -111,7 +111,7 @@ public:
     /**
      * Set the nominal step size: the step taken where the monitor has its reference value. Where step bounds have been set it must lie
      * between them when the next step is taken; the three can be set in any order. In the course of a run the density is kept, so the
-     * steps change in proportion.
+     * steps change in proportion, but for what the bounds say that have been set.
      *
      * @param size    the nominal step size, measured in ps; 0 where no step is to be taken
      */
@@ -258,9 +258,8 @@ public:
     void setReferenceMonitorValue(double value, int index = 0);
     /**
      * Set the reference value of every monitor to its mean over a trial run of fixed steps of the nominal size, or of the two of
-     * automatic step control to their geometric means. The
-     * trial run starts at the current state of the Context, and everything but the reference values and the number of force
-     * evaluations is put back as it was.
+     * automatic step control to their geometric means. The trial run starts at the current state of the Context, and everything but the
+     * reference values and the number of force evaluations is put back as it was.
      *
      * @param steps    the number of trial steps
      */

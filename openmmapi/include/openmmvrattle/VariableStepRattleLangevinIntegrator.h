@@ -110,7 +110,8 @@ public:
     /**
      * Set the reference value U_ref of the monitor, which then stays what it is. With 0, the default, it follows the run, as a running
      * median: by 0.2 % a step up where U is larger, and down where it is smaller, but no lower than max(1/2, S/5) sqrt(kT)/H, S = (sum_c
-     * N_c^4)^(1/8) with the numbers N_c of particles of the clusters, and with the kT of 10 K below that temperature. It begins as U at the first step, or four times that bound if that is less.
+     * N_c^4)^(1/8) with the numbers N_c of particles of the clusters, and with the kT of 10 K below that temperature. It begins as U at
+     * the first step, or four times that bound if that is less.
      *
      * @param value    the reference value in nm amu^(1/2)/ps^2, or 0
      */
