@@ -200,6 +200,16 @@ def test_the_row_of_the_protein_is_that_of_its_page() -> None:
     assert f"{float(measured('time of a turn beside .*, median')[1]):.2f} times" in automatic
 
 
+def test_the_pendulum_has_the_same_errors_on_both_pages() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "where_it_pays.md").read_text(encoding="utf-8")
+    cells = re.search(r"^\| `double-pendulum`: .*$", page, re.MULTILINE)[0].replace("*", "").split(" | ")
+    evaluations, verlet, automatic, _, _, rattle, vrattle, _ = (cell.split()[0] for cell in cells[1:])
+    said = re.search(r"computed the forces as often, ([\d,]+) times;(.*?)`automatic=True`", readme, re.DOTALL)
+    assert said[1] == evaluations
+    assert re.findall(r"([\d.]+) kJ/mol", said[2]) == [verlet, rattle, vrattle, automatic]
+
+
 RECIPE_PAGES = ("openmm", "automatic", "restart", "reporters", "gpu", "migration")
 
 
