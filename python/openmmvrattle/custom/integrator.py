@@ -541,9 +541,9 @@ class CustomVariableStepRattleIntegrator(openmm.CustomIntegrator):
         """Tell the integrator its Context, where it cannot find it: as a member of a CompoundIntegrator, or after
         gc.freeze(), which hides the Context. It does not look for one then.
 
-        In a CompoundIntegrator step(), stepTo(), reverse() and calibrate() of this object are ours, while the steps of the
-        CompoundIntegrator are without the checks of constraints, and on the platforms Reference and CPU do not set the
-        time of the Context right.
+        In a CompoundIntegrator step(), stepTo(), reverse() and calibrate() of this object are ours, while the steps of
+        the CompoundIntegrator are without the checks of constraints, and on the platforms Reference and CPU do not set
+        the time of the Context right.
 
         Parameters
         ----------
