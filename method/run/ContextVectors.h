@@ -56,11 +56,10 @@ public:
     /**
      * Compute the forces of some groups, a bit for each.
      *
-     * @param energyGroup    a group whose energy is wanted, or NO_GROUP
+     * @param energyGroup    a group whose energy is wanted; negative for none
      * @return that energy
      */
     virtual double computeForces(int groups, int energyGroup) = 0;
-    static constexpr int NO_GROUP = -1;
 };
 
 } // namespace OpenMMVRattle

@@ -92,7 +92,7 @@ template <class Method> void HostRunDevice<Method>::setSettings(const Integrator
                           "ForcePNorm, with clearMonitors() and addMonitor(), or call clearMonitors() for fixed steps");
     method.setSettings(from);
     forceGroups = from.getActingForceGroups();
-    monitorForceGroup = from.usesMonitorForceGroup() ? from.monitorForceGroup : ContextVectors::NO_GROUP;
+    energyGroup = from.getEnergyGroup();
 }
 
 template <class Method> bool HostRunDevice<Method>::setParameters(const vector<ExpressionConstraint>& given) {
@@ -205,7 +205,7 @@ template <class Method> double HostRunDevice<Method>::computeForcesAt(const Vect
 }
 
 template <class Method> double HostRunDevice<Method>::computeForces() {
-    const double energy = vectors->computeForces(forceGroups, monitorForceGroup);
+    const double energy = vectors->computeForces(forceGroups, energyGroup);
     numForceEvaluations++;
     return energy;
 }

@@ -127,7 +127,7 @@ protected:
     std::vector<double> masses;
     std::vector<ExpressionConstraint> expressions;
     Method method;
-    int forceGroups = 0, monitorForceGroup = ContextVectors::NO_GROUP;
+    int forceGroups = 0, energyGroup = -1;
     bool hasMassless;
     ForceReach reach;
     std::optional<Ahead> ahead;

@@ -6,8 +6,8 @@
 #include "openmm/OpenMMException.h"
 #include <algorithm>
 #include <cmath>
+#include <iomanip>
 #include <limits>
-#include <sstream>
 
 using namespace OpenMMVRattle;
 using OpenMM::OpenMMException;
@@ -22,11 +22,7 @@ const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
 [[noreturn]] void throwFailure(const IntegratorSettings& settings, const std::string& what, double time,
                                const std::string& reason, const std::string& wayOut) {
-    std::stringstream message;
-    message.precision(10);
-    message << settings.getIntegratorName() << ": " << what << " at t = " << time << " ps failed because " << reason
-            << wayOut;
-    throw OpenMMException(message.str());
+    settings.refuse(std::setprecision(10), what, " at t = ", time, " ps failed because ", reason, wayOut);
 }
 
 } // namespace
@@ -65,15 +61,10 @@ void IntegratorRun::forcesChanged() {
     areForcesChanged = areForcesChanged || saved == nullptr;
 }
 
-std::string IntegratorRun::getName() const {
-    return settings.getIntegratorName();
-}
-
 void IntegratorRun::requireStepSize() const {
-    if (settings.stepSize == 0)
-        throw OpenMMException(
-            getName() + ": the step size is 0, with which a Context computes energies and takes no steps; set one with "
-                        "setStepSize()");
+    settings.require(settings.stepSize != 0,
+                     "the step size is 0, with which a Context computes energies and takes no steps; set one with "
+                     "setStepSize()");
 }
 
 bool IntegratorRun::areConstraintsOthers() const {
@@ -85,47 +76,33 @@ bool IntegratorRun::canTakeSettings() const {
 }
 
 // A run whose constraints move goes through here in each step.
-void IntegratorRun::takeParameters() {
-    if (!areValuesChanged)
+void IntegratorRun::takeSettings() {
+    if (!areSettingsChanged && !areValuesChanged)
         return;
+    if (areSettingsChanged) {
+        settings.requireConsistent();
+        settings.require(!areConstraintsOthers(),
+                         "constraints have been added or replaced since the Context was created; call "
+                         "reinitialize(preserveState=True) of the Context to use them");
+    }
     try {
         takeForcesOfOthers();
+        if (areSettingsChanged)
+            device.setSettings(settings);
         areParametersNew = device.setParameters(settings.expressions) || areParametersNew;
     }
     catch (const StepFailure& failure) {
-        throw OpenMMException(getName() + ": " + failure.what());
+        settings.refuse(failure.what());
     }
     areValuesChanged = false;
-}
-
-void IntegratorRun::takeSettings() {
-    if (!areSettingsChanged) {
-        takeParameters();
+    if (!areSettingsChanged)
         return;
-    }
-    settings.requireConsistent();
-    if (areConstraintsOthers())
-        throw OpenMMException(getName() +
-                              ": constraints have been added or replaced since the Context "
-                              "was created; call reinitialize(preserveState=True) of the Context to use them");
-    try {
-        takeForcesOfOthers();
-        device.setSettings(settings);
-        areParametersNew = device.setParameters(settings.expressions) || areParametersNew;
-    }
-    catch (const StepFailure& failure) {
-        throw OpenMMException(getName() + ": " + failure.what());
-    }
-    const bool isSameGroup =
-        settings.usesMonitorForceGroup() == applied.usesMonitorForceGroup() &&
-        (!settings.usesMonitorForceGroup() || settings.monitorForceGroup == applied.monitorForceGroup);
-    if (!isSameGroup || settings.getActingForceGroups() != applied.getActingForceGroups())
-        task = Task::Start;
     // A start has met the tolerance that there was.
-    if (isAtStart && settings.tolerance != applied.tolerance)
+    if (settings.getActingForceGroups() != applied.getActingForceGroups() ||
+        settings.getEnergyGroup() != applied.getEnergyGroup() || (isAtStart && settings.tolerance != applied.tolerance))
         task = Task::Start;
     applied = settings;
-    areSettingsChanged = areValuesChanged = false;
+    areSettingsChanged = false;
 }
 
 // A device that has no forces but those that were computed last may have those of new parameters already: before anything else is
@@ -254,13 +231,9 @@ void IntegratorRun::stepTo(double time) {
                 askForStep(time);
                 const double last = now;
                 now = device.getTime();
-                if (!(now > last)) {
-                    std::stringstream message;
-                    message << getName() << ": stepTo() makes no way at t = " << now
-                            << " ps, which is so large that a step is lost in its rounding; set the time back with "
-                               "setTime() of the Context";
-                    throw OpenMMException(message.str());
-                }
+                settings.require(now > last, "stepTo() makes no way at t = ", now,
+                                 " ps, which is so large that a step is lost in its rounding; set the time back with "
+                                 "setTime() of the Context");
             }
         });
 }
@@ -283,16 +256,14 @@ std::function<void()> IntegratorRun::keepTask() {
 
 void IntegratorRun::replaceVelocities(const std::function<void()>& set, const std::function<void()>& putBack) {
     findTask(false, false);
-    const auto takeBack = keepTask();
-    try {
+    auto change = [&] {
         set();
         fulfilTask();
-    }
-    catch (...) {
+    };
+    attempt(change, [&, takeBack = keepTask()] {
         putBack();
         takeBack();
-        throw;
-    }
+    });
     device.writeVelocities();
 }
 
@@ -315,9 +286,8 @@ vector<double> IntegratorRun::calibrate(int steps) {
                      "; the Context is unchanged: use a smaller step size");
     }
     for (size_t k = 0; k < means.size(); k++)
-        if (!(means[k] > 0))
-            throw OpenMMException("VariableStepRattleIntegrator: monitor " + std::to_string(k) +
-                                  " is zero all along the trial run of calibrate(); choose another monitor");
+        settings.require(means[k] > 0, "monitor ", k,
+                         " is zero all along the trial run of calibrate(); choose another monitor");
     return means;
 }
 
@@ -344,11 +314,11 @@ vector<double> IntegratorRun::findAutomaticReferences(int steps) {
         vector<double> references;
         for (double logarithm : logarithms) {
             references.push_back(std::exp(logarithm));
-            if (!(references.back() > 2 * negligible))
-                throw OpenMMException(
-                    "VariableStepRattleIntegrator: in the trial run of calibrate() there is no force and "
-                    "nothing moves, so there is nothing to measure steps by; leave it to the run, which "
-                    "finds the reference values as soon as there is something");
+            settings.require(
+                references.back() > 2 * negligible,
+                "in the trial run of calibrate() there is no force and nothing moves, so there is nothing to "
+                "measure steps by; leave it to the run, which finds the reference values as soon as there "
+                "is something");
         }
         return references;
     }

@@ -91,13 +91,11 @@ public:
 private:
     /** What is to be done before the next step, from the least to the greatest. */
     enum class Task { None, ChangeVelocities, ChangeState, Start };
-    std::string getName() const;
     void requireStepSize() const;
     bool areConstraintsOthers() const;
     bool canTakeSettings() const;
     void takeSettings();
     void takeForcesOfOthers();
-    void takeParameters();
     void prepare(bool areForcesInvalid, bool isForStep = false);
     void findTask(bool areForcesInvalid, bool isForStep);
     void fulfilTask();

@@ -2,12 +2,9 @@
 // SPDX-License-Identifier: MIT
 
 #include "run/IntegratorSettings.h"
-#include "openmm/OpenMMException.h"
 #include <algorithm>
-#include <sstream>
 
 using namespace OpenMMVRattle;
-using OpenMM::OpenMMException;
 
 IntegratorSettings::IntegratorSettings(double size) {
     stepSize = size;
@@ -41,15 +38,12 @@ bool IntegratorSettings::isConsistent() const {
 }
 
 void IntegratorSettings::requireConsistent() const {
-    if (isConsistent())
-        return;
-    std::stringstream message;
-    message << getIntegratorName() << ": the minimum step size (" << getMinimumStep()
-            << " ps) must be smaller than the nominal one (" << stepSize << " ps)";
+    std::ostringstream maximum;
     if (!isAutomatic)
-        message << ", and the maximum step size (" << getMaximumStep()
+        maximum << ", and the maximum step size (" << getMaximumStep()
                 << " ps) larger than the nominal one, or 0 for no bound";
-    throw OpenMMException(message.str());
+    require(isConsistent(), "the minimum step size (", getMinimumStep(), " ps) must be smaller than the nominal one (",
+            stepSize, " ps)", maximum.str());
 }
 
 bool OpenMMVRattle::haveSameParts(const ExpressionConstraint& a, const ExpressionConstraint& b) {

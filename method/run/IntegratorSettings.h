@@ -5,7 +5,9 @@
 #define OPENMMVRATTLE_INTEGRATORSETTINGS_H_
 
 #include "expressions/ExpressionGroup.h"
+#include "openmm/OpenMMException.h"
 #include "step/StepSettings.h"
+#include <sstream>
 #include <vector>
 
 namespace OpenMMVRattle {
@@ -17,6 +19,7 @@ namespace OpenMMVRattle {
 struct IntegratorSettings : StepSettings {
     static constexpr double DEFAULT_NORM_ORDER = 8;
     static constexpr int DEFAULT_CALIBRATION_STEPS = 30;
+    static constexpr int NO_GROUP = -1;
 
     int forceGroups = -1;         // a bit for each group that acts, the monitor's perhaps among them
     bool isDefaultMonitor = true; // nobody has chosen it, so it is made to fit the System
@@ -32,6 +35,18 @@ struct IntegratorSettings : StepSettings {
     /** The class of the integrator that has such settings, which is what messages begin with. */
     const char* getIntegratorName() const {
         return langevin ? "VariableStepRattleLangevinIntegrator" : "VariableStepRattleIntegrator";
+    }
+    /** Throw an OpenMMException with a message that begins with that and goes on with these parts. */
+    template <class... Parts> [[noreturn]] void refuse(const Parts&... parts) const {
+        std::ostringstream message;
+        message << getIntegratorName() << ": ";
+        (message << ... << parts);
+        throw OpenMM::OpenMMException(message.str());
+    }
+    /** The same unless something holds. */
+    template <class... Parts> void require(bool holds, const Parts&... parts) const {
+        if (!holds)
+            refuse(parts...);
     }
     /** The seed of random numbers; 0 where there is none, or each Context has another one. */
     int getRandomSeed() const {
@@ -54,6 +69,10 @@ struct IntegratorSettings : StepSettings {
     }
     /** Whether a monitor is the energy of a force group. */
     bool usesMonitorForceGroup() const;
+    /** The force group of whose energy monitors need to know, or NO_GROUP. */
+    int getEnergyGroup() const {
+        return usesMonitorForceGroup() ? monitorForceGroup : NO_GROUP;
+    }
     /** A bit for each force group that acts: those that were chosen, without the monitor's. */
     int getActingForceGroups() const;
     /** Give the default monitor the kind that the System can have, unless the user has chosen monitors. */

@@ -81,20 +81,9 @@ void VRattleRun::setMemory(const Memory& memory) {
     automatic.getControl().setMemory(memory.automatic);
 }
 
-template <class Change> void VRattleRun::attempt(const Change& change) {
-    const Kept before = keep();
-    try {
-        change();
-    }
-    catch (...) {
-        putBack(before);
-        throw;
-    }
-}
-
 void VRattleRun::begin(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                        double energy) {
-    attempt([&] { VRattleDynamics::begin(positions, velocities, forces, energy); });
+    attempt([&] { VRattleDynamics::begin(positions, velocities, forces, energy); }, remember());
 }
 
 void VRattleRun::beginFixedSteps(double stepSize) {
@@ -112,11 +101,12 @@ void VRattleRun::adoptParameters() {
 
 void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                        double energy, const ExpressionParameters& theta, const Memory& memory) {
-    attempt([&] {
+    auto take = [&] {
         now.theta = theta;
         takeOver(positions, velocities, forces, energy);
         control->begin();
-    });
+    };
+    attempt(take, remember());
     now.v = velocities; // which have been projected, and so changed in the last bits
     adopt(memory);
     formHalfStepVelocities();
@@ -134,11 +124,12 @@ void VRattleRun::adopt(const Memory& memory) {
 }
 
 void VRattleRun::resume(const StepState& state, const Memory& memory) {
-    attempt([&] {
+    auto take = [&] {
         now.theta = state.theta;
         takeOver(state.q, state.v, state.force, state.groupEnergy);
         control->begin();
-    });
+    };
+    attempt(take, remember());
     StepState exact = state; // this has projected the velocities, which changes the last bits
     exact.rightSide = now.rightSide;
     exact.forceParts = now.forceParts;
@@ -147,10 +138,11 @@ void VRattleRun::resume(const StepState& state, const Memory& memory) {
 
 void VRattleRun::changeState(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
                              double energy) {
-    attempt([&] {
+    auto take = [&] {
         takeOver(positions, velocities, forces, energy);
         control->change(StepControl::Everything, 1.0);
-    });
+    };
+    attempt(take, remember());
     if (control->hasStarted())
         formHalfStepVelocities();
 }
@@ -189,14 +181,12 @@ void VRattleRun::changeVelocities(const vector<Vec3>& velocities) {
 
 void VRattleRun::changeForces(vector<Vec3>& forces, double energy) {
     const vector<double>& inverseMasses = getConstraintSystem().getInverseMasses();
-    vector<Vec3>& change = solver.next.v;
+    vector<Vec3>& difference = solver.next.v;
     for (int i : constraints.getMovingParticles())
-        change[i] = forces[i] - now.force[i];
-    const double changeSquared = constraints.sumOfSquares(change, inverseMasses);
+        difference[i] = forces[i] - now.force[i];
+    const double changeSquared = constraints.sumOfSquares(difference, inverseMasses);
     const double forceSquared =
         std::max(constraints.sumOfSquares(forces, inverseMasses), constraints.sumOfSquares(now.force, inverseMasses));
-    const Memory memory = getMemory();
-    const vector<double> values = now.values, forceParts = now.forceParts;
     auto exchange = [&] {
         now.force.swap(forces);
         std::swap(now.groupEnergy, energy);
@@ -204,18 +194,18 @@ void VRattleRun::changeForces(vector<Vec3>& forces, double energy) {
         now.rightSide.swap(solver.next.rightSide);
         constraints.moveTo(now.q, now.theta, now.force);
     };
-    exchange();
-    try {
-        constraints.findMultipliers(now.v, now.theta, now.lambda, now.rightSide);
-        control->change(StepControl::Forces, std::min(1.0, std::sqrt(changeSquared / (forceSquared + TINY))));
-    }
-    catch (...) {
+    auto putBack = [&, memory = getMemory(), values = now.values, forceParts = now.forceParts] {
         exchange();
         now.values = values;
         now.forceParts = forceParts;
         setMemory(memory);
-        throw;
-    }
+    };
+    auto change = [&] {
+        constraints.findMultipliers(now.v, now.theta, now.lambda, now.rightSide);
+        control->change(StepControl::Forces, std::min(1.0, std::sqrt(changeSquared / (forceSquared + TINY))));
+    };
+    exchange();
+    attempt(change, putBack);
     if (control->hasStarted())
         formHalfStepVelocities();
 }

@@ -210,7 +210,6 @@ public:
 private:
     void exchange(StepState& state, Memory& memory, RunState::Archive archive, size_t numMonitors, bool isAutomatic);
     void read(const RunState& run, const IntegratorSettings& saved, StepState& state, Memory& memory);
-    template <class Change> void attempt(const Change& change);
     void setMemory(const Memory& memory);
 };
 

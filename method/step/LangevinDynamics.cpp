@@ -203,20 +203,16 @@ void LangevinDynamics::changeState(const Vectors& positions, const Vectors& velo
 
 void LangevinDynamics::takeState(const Vectors& positions, const Vectors& velocities, const Vectors& forces,
                                  double energy) {
-    const std::function<void()> putBack = remember();
-    q = positions;
-    v = velocities;
-    force = forces;
-    groupEnergy = energy;
-    lastSubstep = settings.stepSize;
-    settle();
-    try {
+    auto take = [&] {
+        q = positions;
+        v = velocities;
+        force = forces;
+        groupEnergy = energy;
+        lastSubstep = settings.stepSize;
+        settle();
         evaluateOnStep();
-    }
-    catch (...) {
-        putBack();
-        throw;
-    }
+    };
+    attempt(take, remember());
 }
 
 // A state has been put in place of the one there was.
@@ -251,15 +247,11 @@ std::function<void()> LangevinDynamics::remember() {
 void LangevinDynamics::adopt(const Vectors& positions, const Vectors& velocities, const Vectors& forces, double energy,
                              const ExpressionParameters& parameters, double newReference, bool isFollowed,
                              int64_t drawn) {
-    const ExpressionParameters before = theta;
-    theta = parameters;
-    try {
+    auto take = [&] {
+        theta = parameters;
         takeState(positions, velocities, forces, energy);
-    }
-    catch (...) {
-        theta = before;
-        throw;
-    }
+    };
+    attempt(take, [&, before = theta] { theta = before; });
     v = velocities; // which have been projected, and so changed in the last bits
     reference = newReference;
     numDrawn = drawn;

@@ -5,6 +5,7 @@
 #include "ExpressionCheck.h"
 #include "MaxwellVelocities.h"
 #include "SystemCheck.h"
+#include "constraints/StepFailure.h"
 #include "openmm/CompoundIntegrator.h"
 #include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
@@ -47,12 +48,11 @@ string majorMinor(const string& version) {
 }
 
 // An OpenMM plugin depends on the binary interface of the OpenMM it was built against.
-void checkOpenMMVersion(const string& name) {
+void requireOpenMMVersion(const IntegratorSettings& settings) {
     const string built = OPENMMVRATTLE_OPENMM_VERSION;
     const string running = Platform::getOpenMMVersion();
-    if (majorMinor(running) != built)
-        throw OpenMMException(name + ": this plugin was built for OpenMM " + built + " and cannot run with OpenMM " +
-                              running + "; install openmm==" + built + ".* or rebuild the plugin");
+    settings.require(majorMinor(running) == built, "this plugin was built for OpenMM ", built,
+                     " and cannot run with OpenMM ", running, "; install openmm==", built, ".* or rebuild the plugin");
 }
 
 // Which one of a CompoundIntegrator it is; 0 where it is alone.
@@ -94,21 +94,19 @@ string ConstrainedIntegrator::getName() const {
 }
 
 void ConstrainedIntegrator::requirePositive(double value, const string& name) const {
-    if (!(value > 0) || !std::isfinite(value)) {
-        std::stringstream message;
-        message << getName() << ": the " << name << " must be a positive finite number, not " << value;
-        throw OpenMMException(message.str());
-    }
+    settings->require(value > 0 && std::isfinite(value), "the ", name, " must be a positive finite number, not ",
+                      value);
 }
 
 // What 0 stands for belongs to the message.
 void ConstrainedIntegrator::requirePositiveOrZero(double value, const string& name, const string& zero) const {
-    if (!(value >= 0) || !std::isfinite(value)) {
-        std::stringstream message;
-        message << getName() << ": the " << name << " must be a positive finite number, or 0 " << zero << ", not "
-                << value;
-        throw OpenMMException(message.str());
-    }
+    settings->require(value >= 0 && std::isfinite(value), "the ", name, " must be a positive finite number, or 0 ",
+                      zero, ", not ", value);
+}
+
+void ConstrainedIntegrator::requireIndex(int index, int count, const string& what) const {
+    settings->require(index >= 0 && index < count, "there is no ", what, " with index ", index, "; the integrator has ",
+                      count);
 }
 
 void ConstrainedIntegrator::settingsChanged() {
@@ -127,12 +125,8 @@ void ConstrainedIntegrator::takeOver(const IntegratorSettings& newSettings) {
 
 void ConstrainedIntegrator::takeStepSize(double size) {
     requirePositiveOrZero(size, "step size", "where no step is to be taken");
-    if (size > 0 && size < SMALLEST_STEP_SIZE) {
-        std::stringstream message;
-        message << getName() << ": a step size of " << size << " ps is too small to compute with; set one of "
-                << SMALLEST_STEP_SIZE << " ps or more";
-        throw OpenMMException(message.str());
-    }
+    settings->require(size == 0 || size >= SMALLEST_STEP_SIZE, "a step size of ", size,
+                      " ps is too small to compute with; set one of ", SMALLEST_STEP_SIZE, " ps or more");
     settings->stepSize = size;
     Integrator::setStepSize(size);
     if (run != nullptr)
@@ -177,14 +171,12 @@ long long ConstrainedIntegrator::getNumSolverIterations() const {
 // ------------------------------------------------------------------------------------------ constraints by expressions
 
 void ConstrainedIntegrator::requireFiniteParameter(const string& expression, const string& name, double value) const {
-    if (!std::isfinite(value))
-        throw OpenMMException(getName() + ": the constraint \"" + expression + "\" has the parameter " + name +
-                              ", whose value is not a finite number");
+    settings->require(std::isfinite(value), "the constraint \"", expression, "\" has the parameter ", name,
+                      ", whose value is not a finite number");
 }
 
 void ConstrainedIntegrator::checkConstraint(const string& expression, const vector<int>& particles,
                                             const std::map<string, double>& parameters) {
-    const string constraint = getName() + ": the constraint \"" + expression + "\" ";
     vector<string> names;
     for (const auto& parameter : parameters) {
         names.push_back(parameter.first);
@@ -193,15 +185,15 @@ void ConstrainedIntegrator::checkConstraint(const string& expression, const vect
     vector<int> sorted = particles;
     std::sort(sorted.begin(), sorted.end());
     if (!sorted.empty() && sorted[0] < 0)
-        throw OpenMMException(constraint + "is of particle " + std::to_string(sorted[0]) +
-                              ", and the index of a particle cannot be negative");
+        settings->refuse("the constraint \"", expression, "\" is of particle ", sorted[0],
+                         ", and the index of a particle cannot be negative");
     const auto twice = std::adjacent_find(sorted.begin(), sorted.end());
     if (twice != sorted.end())
-        throw OpenMMException(constraint + "names particle " + std::to_string(*twice) +
-                              " twice; name each particle once");
+        settings->refuse("the constraint \"", expression, "\" names particle ", *twice,
+                         " twice; name each particle once");
     const auto key = std::make_tuple(expression, particles.size(), names);
     if (checkedExpressions.count(key) == 0) {
-        requireValidExpression(expression, (int) particles.size(), parameters, getName());
+        requireValidExpression(expression, (int) particles.size(), parameters, *settings);
         checkedExpressions.insert(key);
     }
 }
@@ -219,9 +211,7 @@ int ConstrainedIntegrator::getNumExpressionConstraints() const {
 }
 
 void ConstrainedIntegrator::checkExpressionConstraintIndex(int index) const {
-    if (index < 0 || index >= getNumExpressionConstraints())
-        throw OpenMMException(getName() + ": there is no expression constraint with index " + std::to_string(index) +
-                              "; the integrator has " + std::to_string(getNumExpressionConstraints()));
+    requireIndex(index, getNumExpressionConstraints(), "expression constraint");
 }
 
 void ConstrainedIntegrator::getExpressionConstraintParameters(int index, string& expression, vector<int>& particles,
@@ -249,9 +239,8 @@ void ConstrainedIntegrator::setExpressionParameterValue(int index, const string&
     checkExpressionConstraintIndex(index);
     ExpressionConstraint& constraint = settings->expressions[index];
     const auto parameter = constraint.parameters.find(name);
-    if (parameter == constraint.parameters.end())
-        throw OpenMMException(getName() + ": the constraint \"" + constraint.expression + "\" has no parameter " +
-                              name);
+    settings->require(parameter != constraint.parameters.end(), "the constraint \"", constraint.expression,
+                      "\" has no parameter ", name);
     requireFiniteParameter(constraint.expression, name, value);
     parameter->second = value;
     if (run != nullptr)
@@ -297,13 +286,8 @@ void ConstrainedIntegrator::step(int steps) {
 
 void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int randomSeed) {
     IntegratorRun& inContext = requireRun();
-    if (!(temperature >= 0) || !std::isfinite(temperature)) {
-        std::stringstream message;
-        message << getName() + ": the temperature must be a finite number of kelvins that is not "
-                               "negative, not "
-                << temperature;
-        throw OpenMMException(message.str());
-    }
+    settings->require(temperature >= 0 && std::isfinite(temperature),
+                      "the temperature must be a finite number of kelvins that is not negative, not ", temperature);
     vector<OpenMM::Vec3> before;
     context->getVelocities(before);
     vector<std::function<void()>> takeBack;
@@ -319,10 +303,10 @@ void ConstrainedIntegrator::setVelocitiesToTemperature(double temperature, int r
 }
 
 void ConstrainedIntegrator::initialize(ContextImpl& contextRef) {
-    checkOpenMMVersion(getName());
+    requireOpenMMVersion(*settings);
     if (owner != NULL && &contextRef.getOwner() != owner)
         throw OpenMMException("This Integrator is already bound to a context");
-    requireSuitableSystem(contextRef, settings->expressions, getName());
+    requireSuitableSystem(contextRef, *settings);
     const OpenMM::System& system = contextRef.getSystem();
     settings->fitDefaultMonitor(hasConstraints(system, *settings));
     if (settings->langevin)
@@ -386,13 +370,7 @@ void ConstrainedIntegrator::resume(const IntegratorSettings& saved, RunState& st
         state.findings.references.clear();
     run->requireUsable(state, next);
     takeOver(next);
-    try {
-        run->resume(state);
-    }
-    catch (...) {
-        takeOver(previous);
-        throw;
-    }
+    attempt([&] { run->resume(state); }, [&] { takeOver(previous); });
 }
 
 void ConstrainedIntegrator::createCheckpoint(std::ostream& stream) const {
@@ -424,10 +402,9 @@ void ConstrainedIntegrator::loadCheckpoint(std::istream& stream) {
     RunState state;
     state.read(data);
     // Whoever has changed the masses or constraints calls Context::reinitialize(), which loads what was saved just before.
-    if (state.system != run->getSystemFingerprint() && state.context != lastSaved)
-        throw OpenMMException(getName() +
-                              ": this checkpoint was made with another System, whose "
-                              "masses or constraints are not those of this one; load it into a Context of that System");
+    settings->require(state.system == run->getSystemFingerprint() || state.context == lastSaved,
+                      "this checkpoint was made with another System, whose masses or constraints are not those of this "
+                      "one; load it into a Context of that System");
     resume(*saved->settings, state);
 }
 
@@ -442,10 +419,9 @@ void ConstrainedIntegrator::deserializeParameters(const SerializationNode& node)
     if (node.getStringProperty("integrator", "") != getName())
         return; // they are another integrator's, or there are none
     const int version = node.getIntProperty("version");
-    if (version != PARAMETERS_VERSION)
-        throw OpenMMException(getName() + ": the State holds parameters in version " + std::to_string(version) +
-                              " of their format and this plugin reads version " + std::to_string(PARAMETERS_VERSION) +
-                              "; use the version of the plugin that wrote them");
+    settings->require(version == PARAMETERS_VERSION, "the State holds parameters in version ", version,
+                      " of their format and this plugin reads version ", PARAMETERS_VERSION,
+                      "; use the version of the plugin that wrote them");
     std::unique_ptr<ConstrainedIntegrator> saved(node.getChildNode("Settings").decodeObject<ConstrainedIntegrator>());
     RunState state;
     state.read(node.getChildNode("Run"));

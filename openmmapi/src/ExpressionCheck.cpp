@@ -6,13 +6,11 @@
 #include "lepton/Operation.h"
 #include "lepton/ParsedExpression.h"
 #include "lepton/Parser.h"
-#include "openmm/OpenMMException.h"
 #include <cstdlib>
 #include <set>
 
 using Lepton::ExpressionTreeNode;
 using Lepton::Operation;
-using OpenMM::OpenMMException;
 using std::string;
 
 namespace OpenMMVRattle {
@@ -37,33 +35,30 @@ int particleOfCoordinate(const string& name) {
 } // namespace
 
 void requireValidExpression(const string& expression, int numParticles, const std::map<string, double>& parameters,
-                            const string& integratorName) {
-    const string constraint = integratorName + ": the constraint \"" + expression + "\" ";
+                            const IntegratorSettings& settings) {
+    const auto require = [&](bool holds, const auto&... parts) {
+        settings.require(holds, "the constraint \"", expression, "\" ", parts...);
+    };
     std::set<string> variables;
     try {
         findVariables(Lepton::Parser::parse(expression).getRootNode(), variables);
     }
     catch (const std::exception& e) {
-        throw OpenMMException(constraint + "cannot be understood: " + e.what());
+        require(false, "cannot be understood: ", e.what());
     }
     for (const auto& parameter : parameters)
-        if (particleOfCoordinate(parameter.first) > 0)
-            throw OpenMMException(constraint + "has a parameter " + parameter.first +
-                                  ", which is the name of a coordinate; give it another name");
+        require(particleOfCoordinate(parameter.first) == 0, "has a parameter ", parameter.first,
+                ", which is the name of a coordinate; give it another name");
     bool hasCoordinate = false;
     for (const string& name : variables) {
         const int particle = particleOfCoordinate(name);
-        if (particle > numParticles)
-            throw OpenMMException(constraint + "contains " + name + " and is of " + std::to_string(numParticles) +
-                                  (numParticles == 1 ? " particle" : " particles") +
-                                  " alone; name as many particles as it contains");
-        if (particle == 0 && parameters.count(name) == 0)
-            throw OpenMMException(constraint + "contains the variable " + name +
-                                  ", which is neither a coordinate (x1, y1, z1, x2, ...) nor one of its parameters");
+        require(particle <= numParticles, "contains ", name, " and is of ", numParticles,
+                numParticles == 1 ? " particle" : " particles", " alone; name as many particles as it contains");
+        require(particle > 0 || parameters.count(name) > 0, "contains the variable ", name,
+                ", which is neither a coordinate (x1, y1, z1, x2, ...) nor one of its parameters");
         hasCoordinate |= particle > 0;
     }
-    if (!hasCoordinate)
-        throw OpenMMException(constraint + "contains no coordinate (x1, y1, z1, x2, ...) and so constrains nothing");
+    require(hasCoordinate, "contains no coordinate (x1, y1, z1, x2, ...) and so constrains nothing");
 }
 
 } // namespace OpenMMVRattle

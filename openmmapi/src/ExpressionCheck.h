@@ -4,6 +4,7 @@
 #ifndef OPENMMVRATTLE_EXPRESSIONCHECK_H_
 #define OPENMMVRATTLE_EXPRESSIONCHECK_H_
 
+#include "run/IntegratorSettings.h"
 #include <map>
 #include <string>
 
@@ -16,10 +17,10 @@ namespace OpenMMVRattle {
  * @param expression      the expression
  * @param numParticles    the number of particles of the constraint
  * @param parameters      the parameters of the constraint
- * @param integratorName    whose messages these are
+ * @param settings        whose messages these are
  */
 void requireValidExpression(const std::string& expression, int numParticles,
-                            const std::map<std::string, double>& parameters, const std::string& integratorName);
+                            const std::map<std::string, double>& parameters, const IntegratorSettings& settings);
 
 } // namespace OpenMMVRattle
 

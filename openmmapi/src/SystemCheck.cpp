@@ -6,7 +6,6 @@
 #include "openmm/MonteCarloBarostat.h"
 #include "openmm/MonteCarloFlexibleBarostat.h"
 #include "openmm/MonteCarloMembraneBarostat.h"
-#include "openmm/OpenMMException.h"
 #include "openmm/Platform.h"
 #include "openmm/System.h"
 #include "openmm/internal/AndersenThermostatImpl.h"
@@ -15,81 +14,63 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
-#include <sstream>
 #include <string>
 #include <vector>
 
 using namespace OpenMMVRattle;
 using OpenMM::ContextImpl;
 using OpenMM::ForceImpl;
-using OpenMM::OpenMMException;
 using OpenMM::System;
 using std::string;
 using std::vector;
 
 namespace {
 
-void requireMasses(const System& system) {
+void requireMasses(const System& system, const IntegratorSettings& settings) {
     for (int i = 0; i < system.getNumParticles(); i++) {
         const double mass = system.getParticleMass(i);
-        if (mass >= 0 && std::isfinite(mass))
-            continue;
-        std::stringstream message;
-        message << "the mass of particle " << i << " is " << mass
-                << " amu, and masses are positive, or 0 for a particle that does not move; correct it with "
-                   "setParticleMass() of the System";
-        throw OpenMMException(message.str());
+        settings.require(mass >= 0 && std::isfinite(mass), "the mass of particle ", i, " is ", mass,
+                         " amu, and masses are positive, or 0 for a particle that does not move; correct it with "
+                         "setParticleMass() of the System");
     }
 }
 
 // To begin a message with.
-string nameOf(const vector<ExpressionConstraint>& expressions, size_t index) {
-    return "expression constraint " + std::to_string(index) + " (" + expressions[index].expression + ") ";
+string nameOf(const IntegratorSettings& settings, size_t index) {
+    return "expression constraint " + std::to_string(index) + " (" + settings.expressions[index].expression + ") ";
 }
 
-void requireExpressions(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
-    if (expressions.empty())
-        return;
-    const System& system = context.getSystem();
-    for (size_t e = 0; e < expressions.size(); e++) {
-        const string constraint = nameOf(expressions, e);
+void requireExpressions(const System& system, const IntegratorSettings& settings) {
+    for (size_t e = 0; e < settings.expressions.size(); e++) {
+        const string constraint = nameOf(settings, e);
         bool canMove = false;
-        for (int particle : expressions[e].particles) {
-            if (particle >= system.getNumParticles())
-                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
-                                      ", and the System has " + std::to_string(system.getNumParticles()));
-            if (system.isVirtualSite(particle))
-                throw OpenMMException(constraint + "is of particle " + std::to_string(particle) +
-                                      ", which is a virtual site; write it with the particles that define the site");
+        for (int particle : settings.expressions[e].particles) {
+            settings.require(particle < system.getNumParticles(), constraint, "is of particle ", particle,
+                             ", and the System has ", system.getNumParticles());
+            settings.require(!system.isVirtualSite(particle), constraint, "is of particle ", particle,
+                             ", which is a virtual site; write it with the particles that define the site");
             canMove |= system.getParticleMass(particle) > 0;
         }
-        if (!canMove)
-            throw OpenMMException(constraint + "has no particle with mass, and so nothing that it could move");
+        settings.require(canMove, constraint, "has no particle with mass, and so nothing that it could move");
     }
 }
 
 // (OpenMM refuses a constraint between a particle with mass and one without; two that do not move may be what is left of a
 // frozen molecule.) A virtual site is where its particles put it, so that a constraint on it would be passed over.
-void requireConstraints(const System& system) {
+void requireConstraints(const System& system, const IntegratorSettings& settings) {
     for (int i = 0; i < system.getNumConstraints(); i++) {
         int particle1, particle2;
         double length;
         system.getConstraintParameters(i, particle1, particle2, length);
-        const auto refuse = [&](const string& reason) {
-            throw OpenMMException("constraint " + std::to_string(i) + " of the System, of the particles " +
-                                  std::to_string(particle1) + " and " + std::to_string(particle2) + ", " + reason);
+        const auto require = [&](bool holds, const auto&... parts) {
+            settings.require(holds, "constraint ", i, " of the System, of the particles ", particle1, " and ",
+                             particle2, ", ", parts...);
         };
-        if (!(length > 0) || !std::isfinite(length)) {
-            std::stringstream number;
-            number << length;
-            refuse(
-                "has a length of " + number.str() +
+        require(length > 0 && std::isfinite(length), "has a length of ", length,
                 " nm, which is not a positive finite number; correct it with setConstraintParameters() of the System");
-        }
         for (int particle : {particle1, particle2})
-            if (system.isVirtualSite(particle))
-                refuse("is of the virtual site " + std::to_string(particle) +
-                       ", which is where the particles that define it put it and cannot be held; constrain those");
+            require(!system.isVirtualSite(particle), "is of the virtual site ", particle,
+                    ", which is where the particles that define it put it and cannot be held; constrain those");
     }
 }
 
@@ -100,11 +81,12 @@ bool usesKernel(const ForceImpl& force, const string& name) {
 
 // A Drude particle moved like any other would take up heat from the rest. The class DrudeForce is in a library of its
 // own, which we do not link with, so it is recognised by its kernel.
-void refuseDrudeParticles(const ForceImpl& force) {
-    if (usesKernel(force, "CalcDrudeForce"))
-        throw OpenMMException("the System has a DrudeForce and Drude particles need an integrator made for "
-                              "them; use DrudeSCFIntegrator, DrudeNoseHooverIntegrator or "
-                              "DrudeLangevinIntegrator, or a force field without Drude particles");
+void refuseDrudeParticles(const ForceImpl& force, const IntegratorSettings& settings) {
+    settings.require(
+        !usesKernel(force, "CalcDrudeForce"),
+        "the System has a DrudeForce and Drude particles need an integrator made for them; use "
+        "DrudeSCFIntegrator, DrudeNoseHooverIntegrator or DrudeLangevinIntegrator, or a force field without "
+        "Drude particles");
 }
 
 // For each particle the number of its group.
@@ -164,14 +146,13 @@ bool findGrouping(const ContextImpl& context, const ForceImpl& impl, Grouping& g
     return true;
 }
 
-void requireKnownGroups(const ContextImpl& context, const ForceImpl& impl,
-                        const vector<ExpressionConstraint>& expressions) {
+void requireKnownGroups(const ContextImpl& context, const ForceImpl& impl, const IntegratorSettings& settings) {
     Grouping grouping;
     if (!findGrouping(context, impl, grouping))
         return;
-    for (size_t e = 0; e < expressions.size(); e++) {
+    for (size_t e = 0; e < settings.expressions.size(); e++) {
         int first = -1;
-        for (int particle : expressions[e].particles) {
+        for (int particle : settings.expressions[e].particles) {
             if (context.getSystem().getParticleMass(particle) == 0)
                 continue; // a fixed point takes up no heat
             if (first < 0)
@@ -179,34 +160,23 @@ void requireKnownGroups(const ContextImpl& context, const ForceImpl& impl,
             if (grouping.groupOf[particle] == grouping.groupOf[first])
                 continue;
             const string name = impl.getOwner().getName();
-            throw OpenMMException(nameOf(expressions, e) + "joins the particles " + std::to_string(first) + " and " +
-                                  std::to_string(particle) + ", which " + name +
-                                  " changes one without the other, since " + grouping.reason + ", so that " +
-                                  grouping.consequence + " would be wrong; " + grouping.wayOut + ", or remove " + name);
+            settings.refuse(nameOf(settings, e), "joins the particles ", first, " and ", particle, ", which ", name,
+                            " changes one without the other, since ", grouping.reason, ", so that ",
+                            grouping.consequence, " would be wrong; ", grouping.wayOut, ", or remove ", name);
         }
-    }
-}
-
-void requireSuitable(ContextImpl& context, const vector<ExpressionConstraint>& expressions) {
-    const System& system = context.getSystem();
-    requireMasses(system);
-    requireConstraints(system);
-    requireExpressions(context, expressions);
-    for (const ForceImpl* force : context.getForceImpls()) {
-        refuseDrudeParticles(*force);
-        if (!expressions.empty())
-            requireKnownGroups(context, *force, expressions);
     }
 }
 
 } // namespace
 
-void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const vector<ExpressionConstraint>& expressions,
-                                          const string& integratorName) {
-    try {
-        requireSuitable(context, expressions);
-    }
-    catch (const OpenMMException& error) {
-        throw OpenMMException(integratorName + ": " + error.what());
+void OpenMMVRattle::requireSuitableSystem(ContextImpl& context, const IntegratorSettings& settings) {
+    const System& system = context.getSystem();
+    requireMasses(system, settings);
+    requireConstraints(system, settings);
+    requireExpressions(system, settings);
+    for (const ForceImpl* force : context.getForceImpls()) {
+        refuseDrudeParticles(*force, settings);
+        if (!settings.expressions.empty())
+            requireKnownGroups(context, *force, settings);
     }
 }

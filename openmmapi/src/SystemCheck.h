@@ -4,9 +4,8 @@
 #ifndef OPENMMVRATTLE_SYSTEMCHECK_H_
 #define OPENMMVRATTLE_SYSTEMCHECK_H_
 
-#include "expressions/ExpressionGroup.h"
 #include "openmm/internal/ContextImpl.h"
-#include <vector>
+#include "run/IntegratorSettings.h"
 
 namespace OpenMMVRattle {
 
@@ -14,11 +13,9 @@ namespace OpenMMVRattle {
  * Refuse what can be known to go wrong before there are positions: masses that are no masses, constraints on virtual sites, Forces
  * that need an integrator of their own, and Forces that would give a wrong ensemble since they know the System's constraints alone.
  *
- * @param integratorName       whose messages these are
- * @throws OpenMMException     which names what it is and the way out
+ * @throws OpenMMException    which names what it is and the way out
  */
-void requireSuitableSystem(OpenMM::ContextImpl& context, const std::vector<ExpressionConstraint>& expressions,
-                           const std::string& integratorName);
+void requireSuitableSystem(OpenMM::ContextImpl& context, const IntegratorSettings& settings);
 
 } // namespace OpenMMVRattle
 

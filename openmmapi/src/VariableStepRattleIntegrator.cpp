@@ -2,21 +2,18 @@
 // SPDX-License-Identifier: MIT
 
 #include "openmmvrattle/VariableStepRattleIntegrator.h"
-#include "openmm/OpenMMException.h"
 #include "openmm/internal/ContextImpl.h"
 #include "run/IntegratorRun.h"
 #include <cmath>
 
 using namespace OpenMMVRattle;
-using OpenMM::OpenMMException;
 using std::string;
 using std::vector;
 
 namespace {
 
-void requireOrder(double order) {
-    if (!(order >= 1) || !std::isfinite(order))
-        throw OpenMMException("VariableStepRattleIntegrator: the order of a norm must be a finite number, at least 1");
+void requireOrder(const IntegratorSettings& settings, double order) {
+    settings.require(order >= 1 && std::isfinite(order), "the order of a norm must be a finite number, at least 1");
 }
 
 } // namespace
@@ -74,20 +71,19 @@ VariableStepRattleIntegrator::UpdateMethod VariableStepRattleIntegrator::getUpda
 }
 
 void VariableStepRattleIntegrator::setUpdateMethod(UpdateMethod method) {
-    if (method < SemiExplicit || method > Bounded)
-        throw OpenMMException(
-            "VariableStepRattleIntegrator: the update method must be SemiExplicit, Explicit or Bounded");
+    settings->require(method >= SemiExplicit && method <= Bounded,
+                      "the update method must be SemiExplicit, Explicit or Bounded");
     settings->update = (StepDensity::Update) method;
     settingsChanged();
 }
 
 int VariableStepRattleIntegrator::addMonitor(MonitorKind kind, double weight, double power, double order) {
-    if (kind < ConstraintMultipliers || kind > ForceGroupEnergy)
-        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor of kind " + std::to_string(kind));
+    settings->require(kind >= ConstraintMultipliers && kind <= ForceGroupEnergy, "there is no monitor of kind ",
+                      (int) kind);
     requirePositive(weight, "weight of a monitor");
     requirePositive(power, "power of a monitor");
     if (order != 0)
-        requireOrder(order);
+        requireOrder(*settings, order);
     settings->isAutomatic = settings->isDefaultMonitor = false;
     settings->terms.push_back({(StepMonitor::Kind) kind, weight, power, 0.0, order == 0 ? settings->normOrder : order});
     settingsChanged();
@@ -101,10 +97,7 @@ void VariableStepRattleIntegrator::clearMonitors() {
 }
 
 void VariableStepRattleIntegrator::useAutomaticStepControl(int steps) {
-    if (steps < 1)
-        throw OpenMMException("VariableStepRattleIntegrator: automatic step control needs at least one calibration "
-                              "step, not " +
-                              std::to_string(steps));
+    settings->require(steps >= 1, "automatic step control needs at least one calibration step, not ", steps);
     clearMonitors();
     settings->isAutomatic = true;
     settings->calibrationSteps = steps;
@@ -142,10 +135,8 @@ int VariableStepRattleIntegrator::getMonitorForceGroup() const {
 }
 
 void VariableStepRattleIntegrator::setMonitorForceGroup(int group) {
-    if (group < 0 || group > 31)
-        throw OpenMMException("VariableStepRattleIntegrator: the force group of the monitor must lie between 0 and 31, "
-                              "not " +
-                              std::to_string(group));
+    settings->require(group >= 0 && group <= 31, "the force group of the monitor must lie between 0 and 31, not ",
+                      group);
     settings->monitorForceGroup = group;
     settingsChanged();
 }
@@ -155,7 +146,7 @@ double VariableStepRattleIntegrator::getNormOrder() const {
 }
 
 void VariableStepRattleIntegrator::setNormOrder(double order) {
-    requireOrder(order);
+    requireOrder(*settings, order);
     settings->normOrder = order;
     for (StepMonitor::Term& monitor : settings->terms)
         monitor.order = order;
@@ -170,10 +161,7 @@ double VariableStepRattleIntegrator::getReferenceMonitorValue(int index) const {
 
 void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int index) {
     checkReferenceIndex(index);
-    if (!(value >= 0) || !std::isfinite(value))
-        throw OpenMMException(
-            "VariableStepRattleIntegrator: the reference value of a monitor must be a positive finite "
-            "number, or 0 to take it at the first step");
+    requirePositiveOrZero(value, "reference value of a monitor", "to take it at the first step");
     settings->reference(index) = value;
     if (value > 0) // it is of this kind of monitor and no other
         settings->isDefaultMonitor = false;
@@ -182,10 +170,8 @@ void VariableStepRattleIntegrator::setReferenceMonitorValue(double value, int in
 
 void VariableStepRattleIntegrator::calibrate(int steps) {
     IntegratorRun& here = requireRun();
-    if (steps < 1)
-        throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs at least one trial step");
-    if (settings->getNumReferences() == 0)
-        throw OpenMMException("VariableStepRattleIntegrator: calibrate() needs a monitor; add one with addMonitor()");
+    settings->require(steps >= 1, "calibrate() needs at least one trial step");
+    settings->require(settings->getNumReferences() > 0, "calibrate() needs a monitor; add one with addMonitor()");
     const vector<double> means = here.calibrate(steps);
     for (size_t i = 0; i < means.size(); i++)
         setReferenceMonitorValue(means[i], (int) i);
@@ -228,8 +214,7 @@ void VariableStepRattleIntegrator::setExpressionConstraintParameter(int index, c
 
 void VariableStepRattleIntegrator::stepTo(double time) {
     IntegratorRun& here = requireRunForStep();
-    if (!std::isfinite(time))
-        throw OpenMMException("VariableStepRattleIntegrator: stepTo() needs a finite time");
+    settings->require(std::isfinite(time), "stepTo() needs a finite time");
     here.stepTo(time);
 }
 
@@ -238,16 +223,14 @@ void VariableStepRattleIntegrator::reverse() {
 }
 
 void VariableStepRattleIntegrator::checkMonitorIndex(int index) const {
-    if (index < 0 || index >= getNumMonitors())
-        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
-                              "; the integrator has " + std::to_string(getNumMonitors()));
+    requireIndex(index, getNumMonitors(), "monitor");
 }
 
 // Of what has a value and a reference value: the monitors, or the two of automatic step control.
 void VariableStepRattleIntegrator::checkReferenceIndex(int index) const {
     if (!settings->isAutomatic)
         checkMonitorIndex(index);
-    else if (index < 0 || index >= settings->getNumReferences())
-        throw OpenMMException("VariableStepRattleIntegrator: there is no monitor with index " + std::to_string(index) +
-                              "; automatic step control has two, 0 and 1");
+    else
+        settings->require(index >= 0 && index < settings->getNumReferences(), "there is no monitor with index ", index,
+                          "; automatic step control has two, 0 and 1");
 }

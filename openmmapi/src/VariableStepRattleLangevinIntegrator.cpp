@@ -2,13 +2,10 @@
 // SPDX-License-Identifier: MIT
 
 #include "openmmvrattle/VariableStepRattleLangevinIntegrator.h"
-#include "openmm/OpenMMException.h"
 #include "run/IntegratorRun.h"
 #include <cmath>
-#include <string>
 
 using namespace OpenMMVRattle;
-using OpenMM::OpenMMException;
 
 VariableStepRattleLangevinIntegrator::VariableStepRattleLangevinIntegrator(double temperature, double frictionCoeff,
                                                                            double stepSize) :
@@ -68,10 +65,8 @@ void VariableStepRattleLangevinIntegrator::setMaximumSubsteps(int substeps) {
             settingsChanged();
             return;
         }
-    throw OpenMMException("VariableStepRattleLangevinIntegrator: the maximum number of substeps must be 1, or 2^k + 1 "
-                          "with k between 1 and " +
-                          std::to_string(LangevinSettings::MAX_DOUBLINGS) + " (3, 5, 9, 17, ...), not " +
-                          std::to_string(substeps));
+    settings->refuse("the maximum number of substeps must be 1, or 2^k + 1 with k between 1 and ",
+                     LangevinSettings::MAX_DOUBLINGS, " (3, 5, 9, 17, ...), not ", substeps);
 }
 
 long long VariableStepRattleLangevinIntegrator::getNumSubstepped() const {

@@ -187,6 +187,8 @@ protected:
     /** Throw an OpenMMException unless a value is positive and finite, or 0 if that stands for something. */
     void requirePositive(double value, const std::string& name) const;
     void requirePositiveOrZero(double value, const std::string& name, const std::string& zero) const;
+    /** Throw one unless there is something with this index. */
+    void requireIndex(int index, int count, const std::string& what) const;
     IntegratorRun& requireRun() const;
     /** The same for one that is about to move the particles. */
     IntegratorRun& requireRunForStep();

@@ -34,8 +34,7 @@ public:
     }
     double computeForces(int groups, int energyGroup) override {
         // The energy first: some platforms use up the forces for it.
-        const double energy =
-            energyGroup == NO_GROUP ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << energyGroup);
+        const double energy = energyGroup < 0 ? 0.0 : context.calcForcesAndEnergy(false, true, 1 << energyGroup);
         context.calcForcesAndEnergy(true, false, groups);
         return energy;
     }
