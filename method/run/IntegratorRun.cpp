@@ -20,11 +20,6 @@ const int MAX_HALVINGS = 8;
 
 const double NO_LIMIT = std::numeric_limits<double>::infinity();
 
-[[noreturn]] void throwFailure(const IntegratorSettings& settings, const std::string& what, double time,
-                               const std::string& reason, const std::string& wayOut) {
-    settings.refuse(std::setprecision(10), what, " at t = ", time, " ps failed because ", reason, wayOut);
-}
-
 } // namespace
 
 IntegratorRun::IntegratorRun(RunDevice& device, const IntegratorSettings& settings, int numParticles,
@@ -65,6 +60,11 @@ void IntegratorRun::requireStepSize() const {
     settings.require(settings.stepSize != 0,
                      "the step size is 0, with which a Context computes energies and takes no steps; set one with "
                      "setStepSize()");
+}
+
+void IntegratorRun::fail(const std::string& what, const StepFailure& failure, const std::string& wayOut) const {
+    settings.refuse(std::setprecision(10), what, " at t = ", device.getTime(), " ps failed because ", failure.what(),
+                    wayOut);
 }
 
 bool IntegratorRun::areConstraintsOthers() const {
@@ -126,7 +126,7 @@ void IntegratorRun::takeSaved() {
         isAtStart = isAtStart && !goesOn;
     }
     catch (const StepFailure& failure) {
-        throwFailure(settings, "going on from a saved run", device.getTime(), failure.what(), "");
+        fail("going on from a saved run", failure);
     }
     saved.reset();
 }
@@ -172,11 +172,10 @@ void IntegratorRun::fulfilTask() {
         areForcesChanged = false;
     }
     catch (const UselessForces& failure) {
-        throwFailure(settings, "the start", device.getTime(), failure.what(),
-                     "; set other positions or parameters, or minimise the energy first");
+        fail("the start", failure, "; set other positions or parameters, or minimise the energy first");
     }
     catch (const StepFailure& failure) {
-        throwFailure(settings, "the start", device.getTime(), failure.what(), "");
+        fail("the start", failure);
     }
 }
 
@@ -205,14 +204,13 @@ template <class Ask> void IntegratorRun::takeSteps(Ask ask) {
             toldSize = size;
             toldDensity = density;
         }
-        throwFailure(settings, "the step", device.getTime(), failure.what(),
-                     settings.langevin
-                         ? "; the Context is in the state before this step: move apart what overlaps, or allow more "
-                           "substeps with setMaximumSubsteps()"
-                     : settings.isAutomatic
-                         ? "; the Context is in the state before this step: use a smaller step size"
-                         : "; the Context is in the state before this step: use a smaller step size, or "
-                           "another monitor");
+        fail("the step", failure,
+             settings.langevin
+                 ? "; the Context is in the state before this step: move apart what overlaps, or allow more "
+                   "substeps with setMaximumSubsteps()"
+             : settings.isAutomatic ? "; the Context is in the state before this step: use a smaller step size"
+                                    : "; the Context is in the state before this step: use a smaller step size, or "
+                                      "another monitor");
     }
 }
 
@@ -245,7 +243,7 @@ void IntegratorRun::reverse() {
         device.reverse();
     }
     catch (const StepFailure& failure) {
-        throwFailure(settings, "reverse()", device.getTime(), failure.what(), "; the Context is unchanged");
+        fail("reverse()", failure, "; the Context is unchanged");
     }
     toldDensity.reset();
 }
@@ -269,58 +267,39 @@ void IntegratorRun::replaceVelocities(const std::function<void()>& set, const st
 
 // ----------------------------------------------------------------------------------------------------------- trial runs
 
+// With automatic step control geometric means of its two, and where steps of the nominal size fail, shorter ones must do.
 vector<double> IntegratorRun::calibrate(int steps) {
     requireStepSize();
     prepare(false);
-    if (settings.isAutomatic)
-        return findAutomaticReferences(steps);
-    vector<double> means(settings.terms.size(), 0.0);
-    try {
-        device.tryOut(settings.stepSize, steps, [&](const vector<double>& values) {
-            for (size_t k = 0; k < means.size(); k++)
-                means[k] += values[k] / steps;
-        });
-    }
-    catch (const StepFailure& failure) {
-        throwFailure(settings, "calibrate()", device.getTime(), failure.what(),
-                     "; the Context is unchanged: use a smaller step size");
-    }
-    for (size_t k = 0; k < means.size(); k++)
-        settings.require(means[k] > 0, "monitor ", k,
-                         " is zero all along the trial run of calibrate(); choose another monitor");
-    return means;
-}
-
-// The geometric means of the two monitors over a trial run of fixed steps. Where steps of the nominal size fail, shorter ones
-// must do.
-vector<double> IntegratorRun::findAutomaticReferences(int steps) {
+    const bool isAutomatic = settings.isAutomatic;
+    const double negligible = device.getNegligibleValue();
     double stepSize = settings.stepSize;
     for (int halvings = 0;; halvings++) {
-        vector<double> logarithms(AutomaticControl::NUM_MONITORS, 0.0);
-        const double negligible = device.getNegligibleValue();
+        vector<double> means(settings.getNumReferences(), 0.0);
         try {
             device.tryOut(stepSize, steps, [&](const vector<double>& values) {
-                for (size_t k = 0; k < logarithms.size(); k++)
-                    logarithms[k] += std::log(std::max(values[k], negligible)) / steps;
+                for (size_t k = 0; k < means.size(); k++)
+                    means[k] += (isAutomatic ? std::log(std::max(values[k], negligible)) : values[k]) / steps;
             });
         }
         catch (const StepFailure& failure) {
-            if (halvings == MAX_HALVINGS)
-                throwFailure(settings, "calibrate()", device.getTime(), failure.what(),
-                             "; the Context is unchanged: use a smaller step size");
+            if (!isAutomatic || halvings == MAX_HALVINGS)
+                fail("calibrate()", failure, "; the Context is unchanged: use a smaller step size");
             stepSize *= 0.5;
             continue;
         }
-        vector<double> references;
-        for (double logarithm : logarithms) {
-            references.push_back(std::exp(logarithm));
+        for (size_t k = 0; k < means.size(); k++) {
+            if (isAutomatic)
+                means[k] = std::exp(means[k]);
             settings.require(
-                references.back() > 2 * negligible,
+                !isAutomatic || means[k] > 2 * negligible,
                 "in the trial run of calibrate() there is no force and nothing moves, so there is nothing to "
                 "measure steps by; leave it to the run, which finds the reference values as soon as there "
                 "is something");
+            settings.require(means[k] > 0, "monitor ", k,
+                             " is zero all along the trial run of calibrate(); choose another monitor");
         }
-        return references;
+        return means;
     }
 }
 

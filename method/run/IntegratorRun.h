@@ -15,6 +15,8 @@
 
 namespace OpenMMVRattle {
 
+class StepFailure;
+
 /**
  * A run in a Context: takes note of changes, starts, steps, tries steps out, saves, goes on from what was saved, and says what failed.
  * It is the same for all platforms and does nothing itself; a RunDevice does.
@@ -92,6 +94,7 @@ private:
     /** What is to be done before the next step, from the least to the greatest. */
     enum class Task { None, ChangeVelocities, ChangeState, Start };
     void requireStepSize() const;
+    [[noreturn]] void fail(const std::string& what, const StepFailure& failure, const std::string& wayOut = "") const;
     bool areConstraintsOthers() const;
     bool canTakeSettings() const;
     void takeSettings();
@@ -102,7 +105,6 @@ private:
     Findings getFindings();
     void askForStep(double maxTime);
     template <class Ask> void takeSteps(Ask ask);
-    std::vector<double> findAutomaticReferences(int steps);
     RunDevice& device;
     const IntegratorSettings& settings;
     IntegratorSettings applied; // those that the device has

@@ -204,10 +204,13 @@ void RunState::Archive::add(const string& name, vector<double>& values, size_t c
         values = from.getMethodValues(name, count);
 }
 
-void RunState::Archive::add(const string& name, double* values, size_t count) {
-    vector<double> list(values, values + count);
-    add(name, list, count);
-    std::copy(list.begin(), list.end(), values);
+void RunState::Archive::add(const string& name, const vector<double*>& numbers) {
+    vector<double> list;
+    for (const double* number : numbers)
+        list.push_back(*number);
+    add(name, list, list.size());
+    for (size_t i = 0; i < list.size(); i++)
+        *numbers[i] = list[i];
 }
 
 void RunState::requireSizes(int numParticles, int numMonitors) const {

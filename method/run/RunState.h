@@ -53,9 +53,10 @@ struct RunState {
         explicit Archive(const RunState& from) : to(nullptr), from(from) {
         }
         void add(const std::string& name, std::vector<double>& values, size_t count);
-        void add(const std::string& name, double* values, size_t count);
+        /** Numbers that stand apart, as one list. */
+        void add(const std::string& name, const std::vector<double*>& numbers);
         void add(const std::string& name, double& value) {
-            add(name, &value, 1);
+            add(name, {&value});
         }
         void add(const std::string& name, bool& value) {
             double number = value;

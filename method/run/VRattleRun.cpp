@@ -99,14 +99,20 @@ void VRattleRun::adoptParameters() {
     constraints.moveTo(now.q, now.theta, now.force);
 }
 
-void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
-                       double energy, const ExpressionParameters& theta, const Memory& memory) {
+// From elsewhere, as if no step had led there.
+void VRattleRun::takeState(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                           double energy, const ExpressionParameters& theta) {
     auto take = [&] {
         now.theta = theta;
         takeOver(positions, velocities, forces, energy);
         control->begin();
     };
     attempt(take, remember());
+}
+
+void VRattleRun::adopt(const vector<Vec3>& positions, const vector<Vec3>& velocities, const vector<Vec3>& forces,
+                       double energy, const ExpressionParameters& theta, const Memory& memory) {
+    takeState(positions, velocities, forces, energy, theta);
     now.v = velocities; // which have been projected, and so changed in the last bits
     adopt(memory);
     formHalfStepVelocities();
@@ -124,12 +130,7 @@ void VRattleRun::adopt(const Memory& memory) {
 }
 
 void VRattleRun::resume(const StepState& state, const Memory& memory) {
-    auto take = [&] {
-        now.theta = state.theta;
-        takeOver(state.q, state.v, state.force, state.groupEnergy);
-        control->begin();
-    };
-    attempt(take, remember());
+    takeState(state.q, state.v, state.force, state.groupEnergy, state.theta);
     StepState exact = state; // this has projected the velocities, which changes the last bits
     exact.rightSide = now.rightSide;
     exact.forceParts = now.forceParts;
@@ -229,22 +230,13 @@ void VRattleRun::exchange(StepState& state, Memory& memory, RunState::Archive ar
     if (!isAutomatic)
         return;
     AutomaticControl::Memory& control = memory.automatic;
-    archive.add("automaticBehind", control.behind, AutomaticControl::NUM_MONITORS);
-    archive.add("automaticAhead", control.ahead, AutomaticControl::NUM_MONITORS);
-    archive.add("automaticValues", control.values, AutomaticControl::NUM_MONITORS);
+    archive.add("automaticBehind", {&control.behind[0], &control.behind[1]});
+    archive.add("automaticAhead", {&control.ahead[0], &control.ahead[1]});
+    archive.add("automaticValues", {&control.values[0], &control.values[1]});
     archive.add("automaticForceSquares", control.forceSquares, getAutomaticControl().getMemory().forceSquares.size());
-    double learning[] = {control.stepsSinceStart, control.numLearnt,   control.logarithms[0],
-                         control.logarithms[1],   control.temperature, control.following};
-    archive.add("automaticLearning", learning, 6);
-    control.stepsSinceStart = learning[0];
-    control.numLearnt = learning[1];
-    std::copy_n(learning + 2, AutomaticControl::NUM_MONITORS, control.logarithms);
-    control.temperature = learning[4];
-    control.following = learning[5];
-    double shortSteps[] = {control.shortSteps, control.mostShortSteps};
-    archive.add("automaticShortSteps", shortSteps, 2);
-    control.shortSteps = shortSteps[0];
-    control.mostShortSteps = shortSteps[1];
+    archive.add("automaticLearning", {&control.stepsSinceStart, &control.numLearnt, &control.logarithms[0],
+                                      &control.logarithms[1], &control.temperature, &control.following});
+    archive.add("automaticShortSteps", {&control.shortSteps, &control.mostShortSteps});
 }
 
 void VRattleRun::save(RunState& run) {

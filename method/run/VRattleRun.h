@@ -90,7 +90,7 @@ public:
         return constraints.getNumIterations();
     }
     long long getNumRescues() const {
-        return control->getNumRescues();
+        return monitors.getNumRescues();
     }
     StepCounts getCounts();
 
@@ -211,6 +211,8 @@ private:
     void exchange(StepState& state, Memory& memory, RunState::Archive archive, size_t numMonitors, bool isAutomatic);
     void read(const RunState& run, const IntegratorSettings& saved, StepState& state, Memory& memory);
     void setMemory(const Memory& memory);
+    void takeState(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
+                   const std::vector<OpenMM::Vec3>& forces, double groupEnergy, const ExpressionParameters& theta);
 };
 
 } // namespace OpenMMVRattle

@@ -208,7 +208,7 @@ void LangevinDynamics::takeState(const Vectors& positions, const Vectors& veloci
         v = velocities;
         force = forces;
         groupEnergy = energy;
-        lastSubstep = settings.stepSize;
+        lastSubstep = 0;
         settle();
         evaluateOnStep();
     };
@@ -253,6 +253,7 @@ void LangevinDynamics::adopt(const Vectors& positions, const Vectors& velocities
     };
     attempt(take, [&, before = theta] { theta = before; });
     v = velocities; // which have been projected, and so changed in the last bits
+    lastSubstep = settings.stepSize;
     reference = newReference;
     numDrawn = drawn;
     if (!isFollowed)
@@ -314,8 +315,9 @@ void LangevinDynamics::reverse() {
 
 double LangevinDynamics::computeHalfStepKineticEnergy() {
     const vector<int>& particles = solver.getMovingParticles();
+    const double kick = 0.5 * (lastSubstep > 0 ? lastSubstep : settings.stepSize);
     for (int i : particles)
-        wNext[i] = vNext[i] = v[i] - force[i] * (0.5 * lastSubstep * getConstraintSystem().getInverseMasses()[i]);
+        wNext[i] = vNext[i] = v[i] - force[i] * (kick * getConstraintSystem().getInverseMasses()[i]);
     if (!isAtStart)
         solver.moveTo(q, theta, force);
     isAtStart = true;

@@ -53,7 +53,7 @@ public:
     struct Memory {
         std::vector<double> parameters, parameterRates; // theta[n], and dtheta/dt of the step to it
         std::vector<double> multipliers;                // Lambda(q[n],p[n]), in internal order
-        double monitorValue, lastSubstep;               // U(q[n],p[n]); d of the last step, H before it
+        double monitorValue, lastSubstep;               // U(q[n],p[n]); d of the last step, 0 before it
     };
 
     LangevinDynamics(const std::vector<double>& masses, const std::vector<DistanceConstraint>& constraints,
@@ -222,7 +222,7 @@ private:
     std::vector<double> lambda; // Lambda(q[n],p[n])
     std::vector<double> values; // U(q[n],p[n]), alone
     double reference; // U_ref, 0 while it is not known
-    double lastSubstep; // d of the last step; H if there was none since the state was changed
+    double lastSubstep; // d of the last step; 0 if there was none since the state was changed
     int64_t seed; // 0: there is none yet
     int64_t numDrawn; // steps that have drawn noise
     Vectors givenNoise;

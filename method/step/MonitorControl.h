@@ -24,7 +24,7 @@ public:
     void setReferences(const std::vector<double>& references) override {
         monitor.references = references;
     }
-    long long getNumRescues() const override {
+    long long getNumRescues() const {
         return numRescues;
     }
     void applySettings(const StepSettings& newSettings) override;

@@ -51,9 +51,6 @@ public:
     virtual std::vector<double> getValues() const = 0;
     virtual std::vector<double> getReferences() const = 0;
     virtual void setReferences(const std::vector<double>& references) = 0;
-    virtual long long getNumRescues() const {
-        return 0;
-    }
     const StepMemory& getMemory() const {
         return *this;
     }

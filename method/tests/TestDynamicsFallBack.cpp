@@ -210,6 +210,28 @@ void testDihedralOverLine() {
     assertThrows("could not be solved for", [&] { other.step(INFINITY); });
 }
 
+// A step whose sum update gives no positive density is counted for good, whatever controls the steps afterwards.
+void testCountOfRescues() {
+    VRattleRun dynamics({10}, {});
+    VRattleRun::Settings settings = {
+        0.001, 0, 0, 1e-8, StepDensity::Explicit, {{StepMonitor::AppliedForce, 1.0, 1.0, 0.0}}, false};
+    dynamics.setSettings(settings);
+    dynamics.begin({Vec3()}, {Vec3(1, 0, 0)}, {Vec3(100, 0, 0)}, 0);
+    for (double force : {100, 100, 1, 1}) { // u falls to 0.01, where 2u - rho is negative
+        ASSERT_EQUAL(0, dynamics.getNumRescues());
+        vector<Vec3> forces;
+        do {
+            dynamics.step(INFINITY);
+            forces = {Vec3(force, 0, 0)};
+        } while (!dynamics.finish(forces, 0));
+    }
+    ASSERT_EQUAL(1, dynamics.getNumRescues());
+    settings.isAutomatic = true;
+    settings.terms.clear();
+    dynamics.setSettings(settings);
+    ASSERT_EQUAL(1, dynamics.getNumRescues());
+}
+
 int main() {
     return runTests({
         {"projection of a chain, dense", [] { testProjectionOfChain(24); }},
@@ -219,5 +241,6 @@ int main() {
         {"a large step", testLargeStep},
         {"the density of large steps", testDensityOfLargeSteps},
         {"a dihedral angle over a line", testDihedralOverLine},
+        {"the count of rescues", testCountOfRescues},
     });
 }

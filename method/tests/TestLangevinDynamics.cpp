@@ -325,6 +325,37 @@ void testRandomNumbers() {
     ASSERT(std::fabs(product) < 5 * error);
 }
 
+// The kinetic energy is that of P (v - d/2 M^-1 F): d is that of the last step, and before one the step size that is set by now.
+void testKineticEnergy() {
+    Example e = makeExample();
+    LangevinDynamics dynamics = makeDynamics(e);
+    LangevinDynamics::Settings settings = makeSettings();
+    auto expected = [&](double d) {
+        Vectors w = dynamics.getVelocities();
+        const Vectors forces = forceAt(dynamics.getPositions());
+        for (size_t i = 0; i < w.size(); i++)
+            w[i] -= forces[i] * (0.5 * d / e.masses[i]);
+        DenseSolver{e}.project(dynamics.getPositions(), w);
+        double sum = 0;
+        for (size_t i = 0; i < w.size(); i++)
+            sum += 0.5 * e.masses[i] * w[i].dot(w[i]);
+        return sum;
+    };
+    dynamics.setSettings(settings);
+    begin(dynamics, e);
+    const double old = expected(settings.stepSize);
+    ASSERT_EQUAL_TOL(old, dynamics.computeHalfStepKineticEnergy(), 1e-10);
+    settings.stepSize /= 4;
+    dynamics.setSettings(settings);
+    ASSERT(std::fabs(expected(settings.stepSize) / old - 1) > 1e-6); // what is to be told apart
+    ASSERT_EQUAL_TOL(expected(settings.stepSize), dynamics.computeHalfStepKineticEnergy(), 1e-10);
+    takeStep(dynamics);
+    const double d = settings.stepSize / dynamics.getLargestSubsteps();
+    settings.stepSize *= 2;
+    dynamics.setSettings(settings);
+    ASSERT_EQUAL_TOL(expected(d), dynamics.computeHalfStepKineticEnergy(), 1e-10);
+}
+
 // A force that is no number, however small the substeps, ends the step; the state is that before it.
 void testFailureLeavesTheState() {
     Example e = makeExample();
@@ -464,6 +495,7 @@ int main() {
         {"NeedsOneProjection", testNeedsOneProjection},
         {"TriesAgainWithTheSameNoise", testTriesAgainWithTheSameNoise},
         {"RandomNumbers", testRandomNumbers},
+        {"KineticEnergy", testKineticEnergy},
         {"FailureLeavesTheState", testFailureLeavesTheState},
         {"Reference", testReference},
         {"HeatDoesNotCaptureTheReference", testHeatDoesNotCaptureTheReference},
