@@ -40,21 +40,6 @@ def kinetic_energy(test_system):
     return 0.5 * np.sum(masses_of(test_system.system)[:, None] * test_system.velocities**2)
 
 
-def test_name_is_that_of_the_registry(built):
-    name, test_system = built
-    assert test_system.name == name
-
-
-def test_parts_have_the_same_particles(built):
-    _, test_system = built
-    particles = test_system.system.getNumParticles()
-    assert test_system.positions.shape == (particles, 3)
-    assert test_system.velocities.shape == (particles, 3)
-    assert test_system.topology.getNumAtoms() == particles
-    assert np.all(np.isfinite(test_system.positions))
-    assert np.all(np.isfinite(test_system.velocities))
-
-
 def test_start_meets_the_constraints(built):
     _, test_system = built
     system = test_system.system
@@ -67,8 +52,15 @@ def test_start_meets_the_constraints(built):
         assert abs(separation @ relative_velocity) < 1e-13
 
 
-def test_settings_name_things_that_exist(built):
-    _, test_system = built
+def test_a_system_is_whole(built):
+    """Its name is that of the registry, all of it has the same particles, and its settings name things that exist."""
+    name, test_system = built
+    assert test_system.name == name
+    particles = test_system.system.getNumParticles()
+    assert test_system.topology.getNumAtoms() == particles
+    for vectors in (test_system.positions, test_system.velocities):
+        assert vectors.shape == (particles, 3)
+        assert np.all(np.isfinite(vectors))
     settings = test_system.settings
     assert settings.total_time > 0
     assert settings.force_evaluations > 0
@@ -80,10 +72,9 @@ def test_settings_name_things_that_exist(built):
             assert hasattr(VariableStepRattleIntegrator, monitor.kind)
 
 
-def test_systems_cannot_be_changed_by_accident(built):
-    _, test_system = built
+def test_systems_cannot_be_changed_by_accident():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        test_system.name = "other"
+        testsystems.double_pendulum().name = "other"
 
 
 def test_pendulum_energy():

@@ -153,10 +153,10 @@ def test_defaults_in_signatures():
     assert defaults(VariableStepRattleIntegrator.useAutomaticStepControl) == {"calibrationSteps": 30}
 
 
-@pytest.mark.parametrize("name, value", [*UPDATE_METHODS.items(), *MONITOR_KINDS.items()])
-def test_constants(name, value):
-    assert getattr(VariableStepRattleIntegrator, name) == value
-    assert name in inspect.getdoc(VariableStepRattleIntegrator)
+def test_constants():
+    for name, value in {**UPDATE_METHODS, **MONITOR_KINDS}.items():
+        assert getattr(VariableStepRattleIntegrator, name) == value, name
+        assert name in inspect.getdoc(VariableStepRattleIntegrator)
 
 
 # Settings and their units
@@ -266,46 +266,24 @@ def test_no_monitors_by_keyword():
 # Errors
 
 
-@pytest.mark.parametrize("size", [-0.001, math.nan, math.inf])
-def test_step_size_must_be_positive_and_finite(size):
-    with pytest.raises(openmm.OpenMMException, match="step size"):
-        VariableStepRattleIntegrator(size)
-    with pytest.raises(openmm.OpenMMException, match="step size"):
-        VariableStepRattleIntegrator(0.002).setNominalStepSize(size)
-
-
 @pytest.mark.parametrize(
-    "call",
+    "call, message",
     [
-        lambda i: i.setMinimumStepSize(-0.001),
-        lambda i: i.setMinimumStepSize(math.nan),
-        lambda i: i.setMaximumStepSize(-0.001),
-        lambda i: i.setMaximumStepSize(math.inf),
-        lambda i: i.setUpdateMethod(3),
-        lambda i: i.setUpdateMethod(-1),
-        lambda i: i.addMonitor(11),
-        lambda i: i.addMonitor(-1),
-        lambda i: i.addMonitor(VariableStepRattleIntegrator.MaxForce, weight=0),
-        lambda i: i.addMonitor(VariableStepRattleIntegrator.MaxForce, power=math.nan),
-        lambda i: i.getMonitor(1),
-        lambda i: i.getMonitor(-1),
-        lambda i: i.getReferenceMonitorValue(1),
-        lambda i: i.setReferenceMonitorValue(-1.0),
-        lambda i: i.setReferenceMonitorValue(math.nan),
-        lambda i: i.setReferenceMonitorValue(1.0, 1),
-        lambda i: i.setMonitorForceGroup(32),
-        lambda i: i.setMonitorForceGroup(-1),
-        lambda i: i.addMonitor(VariableStepRattleIntegrator.ForcePNorm, order=0.5),
-        lambda i: i.setNormOrder(0.5),
-        lambda i: i.setNormOrder(math.nan),
-        lambda i: i.setConstraintTolerance(0),
-        lambda i: i.setConstraintTolerance(math.nan),
+        (lambda i: VariableStepRattleIntegrator(-0.001), "the step size must be"),
+        (lambda i: i.setMinimumStepSize(math.nan), "minimum step size must be"),
+        (lambda i: i.setUpdateMethod(3), "must be SemiExplicit, Explicit or Bounded"),
+        (lambda i: i.setUpdateMethod(-1), "must be SemiExplicit, Explicit or Bounded"),
+        (lambda i: i.addMonitor(11), "no .*kind"),
+        (lambda i: i.addMonitor(-1), "no .*kind"),
+        (lambda i: i.getMonitor(1), "no monitor with index 1"),
+        (lambda i: i.getMonitor(-1), "no monitor with index -1"),
+        (lambda i: i.setReferenceMonitorValue(1.0, 1), "no monitor with index 1"),
     ],
 )
-def test_wrong_values_raise_openmm_exceptions(call):
-    with pytest.raises(openmm.OpenMMException) as error:
+def test_wrong_values_raise_openmm_exceptions(call, message):
+    """What C++ throws, and numbers that are none of an enumeration's; which values are wrong is tested in C++."""
+    with pytest.raises(openmm.OpenMMException, match=message):
         call(VariableStepRattleIntegrator(0.002))
-    assert str(error.value)
 
 
 @pytest.mark.parametrize(
