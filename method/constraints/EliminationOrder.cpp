@@ -219,7 +219,10 @@ EliminationOrder findEliminationOrder(int size, const MatrixEntries& entries) {
     return arrange(order, levels, places, numNarrow);
 }
 
-EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, int numOuter) {
+namespace {
+
+// Those that are eliminated in a round are of the few couplings, or of no more than the given share of all rows have.
+EliminationOrder eliminateInRounds(int size, const MatrixEntries& entries, int numOuter, double share) {
     const size_t FEW = 5;
     vector<vector<int>> neighbours(size + numOuter); // of what is left, sorted
     for (const auto& entry : entries) {
@@ -241,12 +244,10 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, i
         degrees.clear();
         for (int row : left)
             degrees.push_back(degree(row));
-        if (*std::min_element(degrees.begin(), degrees.end()) >= (size_t) EliminationOrder::WIDE)
+        std::sort(degrees.begin(), degrees.end());
+        if (degrees[0] >= (size_t) EliminationOrder::WIDE)
             break;
-        // Half of the rows are candidates, or what is coupled more than its ends, as a rod, would be eliminated from there alone.
-        const auto median = degrees.begin() + (degrees.size() - 1) / 2;
-        std::nth_element(degrees.begin(), median, degrees.end());
-        const size_t most = std::max(*median, FEW);
+        const size_t most = std::max(degrees[(size_t) (share * (double) (degrees.size() - 1))], FEW);
         candidates.clear();
         std::copy_if(left.begin(), left.end(), std::back_inserter(candidates),
                      [&](int row) { return degree(row) <= most; });
@@ -295,6 +296,14 @@ EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, i
     const auto wide = std::find_if(places.begin(), places.end(),
                                    [&](int place) { return tree.counts[place] >= EliminationOrder::WIDE; });
     return arrange(order, levels, places, (int) (wide - places.begin()));
+}
+
+} // namespace
+
+EliminationOrder findEliminationRounds(int size, const MatrixEntries& entries, int numOuter) {
+    const EliminationOrder careful = eliminateInRounds(size, entries, numOuter, 0);
+    const EliminationOrder eager = eliminateInRounds(size, entries, numOuter, 0.5);
+    return 2 * eager.numLevels < careful.numLevels ? eager : careful;
 }
 
 } // namespace OpenMMVRattle
