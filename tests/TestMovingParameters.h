@@ -4,7 +4,9 @@
 // Parameters of constraints and of Forces that change from step to step. Each platform's tests/ includes this file and its own setup.
 
 #include "TestExpressionConstraints.h"
+#include "openmm/CompoundIntegrator.h"
 #include "openmm/HarmonicBondForce.h"
+#include "openmm/VerletIntegrator.h"
 
 namespace OpenMMVRattle {
 
@@ -253,6 +255,80 @@ inline void testStepToWhileMoving() {
     }
 }
 
+// Members of a CompoundIntegrator that take turns while a pivot moves, against plain RATTLE of the pendulum: a member whose turn
+// comes starts where its constraint is by then, and is led from there by its further steps. Whether others have taken steps is seen
+// whatever the user makes of the clock.
+inline void testMembersThatTakeTurns() {
+    const double h = 0.004, mass = 2, way = 0.004;
+    auto acceleration = [](const Vec3& q) { return Vec3(-40 * q[0], 0, -10); };
+    for (const bool isOtherOurs : {true, false}) {
+        System system;
+        system.addParticle(mass);
+        auto* field = new CustomExternalForce("20*z+40*x^2");
+        field->addParticle(0);
+        system.addForce(field);
+        CompoundIntegrator compound;
+        vector<Integrator_*> ours;
+        for (int i = 0; i < 2; i++) {
+            if (i == 1 && !isOtherOurs) {
+                compound.addIntegrator(new VerletIntegrator(h));
+                continue;
+            }
+            ours.push_back(new Integrator_(h));
+            ours.back()->clearMonitors();
+            ours.back()->setConstraintTolerance(1e-12);
+            ours.back()->addConstraint("sqrt((x1-px)^2+y1^2+z1^2)-1", {0}, {{"px", 0.0}});
+            compound.addIntegrator(ours.back());
+        }
+        Context context(system, compound, getTestPlatform());
+        Vec3 q(0.6, 0, 0.8), v(0, 1, 0), pivot;
+        context.setPositions({q});
+        context.setVelocities({v});
+        auto along = [](const Vec3& r) { return r / std::sqrt(r.dot(r)); };
+        for (int turn = 0; turn < 4; turn++) {
+            compound.setCurrentIntegrator(turn % 2);
+            context.setStepCount(0);
+            context.setTime(0);
+            for (int i = 0; i < 2; i++) {
+                const Vec3 before = pivot;
+                pivot[0] += way;
+                for (Integrator_* each : ours)
+                    each->setExpressionParameterValue(0, "px", pivot[0]);
+                compound.step(1);
+                if (turn % 2 == 1 && !isOtherOurs) {
+                    v += acceleration(q) * h;
+                    q += v * h;
+                }
+                else {
+                    Vec3 n = along(q - (i == 0 ? pivot : before));
+                    if (i == 0) {
+                        q = pivot + n;
+                        v -= n * n.dot(v);
+                    }
+                    // |q + h (v - l n) - pivot| = 1, a quadratic equation for h l.
+                    v += acceleration(q) * (h / 2);
+                    const Vec3 to = q + v * h - pivot;
+                    const double b = to.dot(n), change = b - std::sqrt(b * b - to.dot(to) + 1);
+                    v -= n * (change / h);
+                    q += v * h;
+                    n = along(q - pivot);
+                    v += acceleration(q) * (h / 2);
+                    v -= n * n.dot(v - (i == 0 ? Vec3() : (pivot - before) / h));
+                }
+                const State state = context.getState(State::Positions | State::Velocities);
+                const Vec3 error = state.getPositions()[0] - q, errorOfVelocity = state.getVelocities()[0] - v;
+                ASSERT(std::sqrt(error.dot(error)) < 1e-10);
+                ASSERT(std::sqrt(errorOfVelocity.dot(errorOfVelocity)) < 1e-8);
+                if (i == 1)
+                    continue;
+                // Nobody is disturbed by a member that is asked while another has its turn, or by a save.
+                ours[isOtherOurs ? 1 - turn % 2 : 0]->getMultipliers();
+                loadCheckpoint(context, checkpointOf(context));
+            }
+        }
+    }
+}
+
 inline TestList getMovingParameterTests() {
     return {{"cost and energy balance", testCostAndBalance},
             {"the monitor of half steps after a jump of the force", testMonitorAfterJumpOfForce},
@@ -260,7 +336,8 @@ inline TestList getMovingParameterTests() {
             {"runs saved in the middle", testSavedInTheMiddle},
             {"a trial run in between", testTrialRunInBetween},
             {"a jump that is too large", testTooLargeJump},
-            {"stepTo()", testStepToWhileMoving}};
+            {"stepTo()", testStepToWhileMoving},
+            {"members that take turns", testMembersThatTakeTurns}};
 }
 
 } // namespace OpenMMVRattle

@@ -53,6 +53,8 @@ public:
     /** Throw an OpenMMException if nobody has set positions. */
     virtual void requirePositions() = 0;
     virtual void computeVirtualSites() = 0;
+    /** Let nobody take the forces there are for those of the positions there are. */
+    virtual void invalidateForces() = 0;
     /**
      * Compute the forces of some groups, a bit for each.
      *

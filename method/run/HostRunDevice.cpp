@@ -150,13 +150,28 @@ template <class Method> void HostRunDevice<Method>::start() {
 // Go on from the Context's state, moved onto the constraints.
 template <class Method> void HostRunDevice<Method>::takeContext(bool isStart) {
     Vectors positions = vectors->getPositions(), forces;
-    method.projectPositions(positions); // a barostat that moves each particle by itself keeps no constraint either
+    // A barostat that moves each particle by itself keeps no constraint either.
+    method.projectPositions(positions, method.getParameters());
     const double energy = computeForcesAt(positions, forces);
     if (isStart)
         method.begin(positions, vectors->getVelocities(), forces, energy);
     else
         method.changeState(positions, vectors->getVelocities(), forces, energy);
     noteContext();
+    stepMark = getStepMark();
+}
+
+template <class Method> void HostRunDevice<Method>::changeState() {
+    if (!haveOthersStepped()) {
+        takeContext(false);
+        return;
+    }
+    // Nobody knows where others have had the constraints before their last step.
+    auto take = [&] {
+        method.adoptParameters();
+        takeContext(false);
+    };
+    attempt(take, method.remember());
 }
 
 template <class Method> void HostRunDevice<Method>::changeVelocities() {
@@ -190,8 +205,11 @@ template <class Method> double HostRunDevice<Method>::computeForcesAt(const Vect
     const bool isElsewhere = differ(vectors->getPositions(), positions);
     double energy = 0;
     auto putBack = [&, before = isElsewhere ? vectors->getPositions() : Vectors()] {
-        if (isElsewhere)
-            vectors->setPositions(before);
+        if (!isElsewhere)
+            return;
+        vectors->setPositions(before);
+        if (vectors->isSharedByIntegrators())
+            vectors->invalidateForces();
     };
     auto compute = [&] {
         if (isElsewhere)
@@ -273,6 +291,7 @@ template <class Method> void HostRunDevice<Method>::step(double maxTime) {
     lastStep.density = method.getDensity();
     ahead.reset();
     HostRunDevice::writeVelocities();
+    stepMark = getStepMark();
 }
 
 // The positions of the Context before a step.
@@ -382,6 +401,10 @@ bool HostRunDevice<Method>::resume(const RunState& run, const IntegratorSettings
         ahead = Ahead{run.contextPositions.empty() ? vectors->getPositions() : run.contextPositions,
                       run.contextVelocities.empty() ? vectors->getVelocities() : run.contextVelocities};
     std::copy(run.boxVectors, run.boxVectors + 3, boxVectors);
+    // That others have taken steps before it was saved shows in the positions.
+    const bool areOthers = vectors->isSharedByIntegrators() &&
+                           differ(vectors->getPositions(), ahead ? ahead->positions : method.getPositions());
+    stepMark = areOthers ? NO_MARK : getStepMark();
     return true;
 }
 

@@ -11,6 +11,7 @@
 #include "run/Fingerprint.h"
 #include "run/ForceReach.h"
 #include "run/RunDevice.h"
+#include <limits>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -58,9 +59,7 @@ public:
         return fingerprintOf(vectors->getParameters());
     }
     void start() override;
-    void changeState() override {
-        takeContext(false);
-    }
+    void changeState() override;
     void changeVelocities() override;
     void writeVelocities() override;
     void changeForces() override;
@@ -115,6 +114,15 @@ protected:
     void takeContext(bool isStart);
     void noteContext();
     bool isOtherBox();
+    /** A number that is another one when any integrator has taken a step. */
+    virtual long long getStepMark() {
+        return vectors->getStepCount();
+    }
+    /** Whether another integrator (of a CompoundIntegrator) has taken steps. */
+    bool haveOthersStepped() {
+        return vectors->isSharedByIntegrators() && getStepMark() != stepMark;
+    }
+    static constexpr long long NO_MARK = std::numeric_limits<long long>::min();
     /** How far a position that is loaded may be from the one that was saved (nm). */
     virtual double getPositionRounding() const {
         return 0;
@@ -133,6 +141,7 @@ protected:
     std::optional<Ahead> ahead;
     OpenMM::Vec3 boxVectors[3]; // when they were last looked at
     LastStep lastStep = {0, 1};
+    long long stepMark = NO_MARK; // of the last step, or NO_MARK if others have taken some
     long long numForceEvaluations = 0;
 };
 

@@ -94,7 +94,10 @@ public:
      * @throws StepFailure    if that is not possible, or if requireSoundStart() (StartCheck.h) finds something
      */
     virtual void start() = 0;
-    /** Go on from a state that a Force has changed (a barostat, say): as start(), but the density goes on, scaled with u. */
+    /**
+     * Go on from a state that a Force has changed (a barostat, say): as start(), but the density goes on, scaled with u. Values of the
+     * parameters of expressions that are set are put in force at once only where another integrator has taken steps.
+     */
     virtual void changeState() = 0;
     /** Go on with changed velocities at the same positions, without computing forces; the density goes on, scaled with u. */
     virtual void changeVelocities() = 0;

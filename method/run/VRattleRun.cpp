@@ -96,6 +96,7 @@ void VRattleRun::beginFixedSteps(double stepSize) {
 
 void VRattleRun::adoptParameters() {
     now.theta.values = solver.motion.target;
+    solver.motion.rest(now.theta);
     constraints.moveTo(now.q, now.theta, now.force);
 }
 

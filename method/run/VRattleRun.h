@@ -125,13 +125,13 @@ public:
 
     /**
      * Move positions to the nearest configuration (in the mass metric, to first order) that satisfies the constraints;
-     * those that do so to the tolerance are left as they are. The parameters of expressions are those in force, theta[n].
+     * those that do so to the tolerance are left as they are.
      *
      * @return whether the positions were changed
      * @throws StepFailure    if there is no such configuration nearby
      */
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions) {
-        return constraints.projectPositions(positions, now.theta);
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions, const ExpressionParameters& theta) {
+        return constraints.projectPositions(positions, theta);
     }
     /** Change the parameters of an expression: those that the next step leads to. */
     void setParameters(int expression, const std::map<std::string, double>& parameters) {
@@ -159,7 +159,7 @@ public:
                const Memory& memory);
     /** Take over what somebody else has carried on; the state is another. */
     void adopt(const Memory& memory);
-    /** Put parameters that are set in force at once, before positions are projected and the run starts afresh with begin(). */
+    /** Put parameters that are set in force at once, and at rest: before a start, or where others have taken the last steps. */
     void adoptParameters();
     /** Take over reference values U_k,ref that are in force, as from a saved run; 0 for those that are not known. */
     void setReferences(const std::vector<double>& references) {

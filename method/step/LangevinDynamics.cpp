@@ -181,13 +181,14 @@ int LangevinDynamics::findNotFinite(const Vectors& x, const vector<int>& particl
 
 // ------------------------------------------------------------------------------------------------- between two steps
 
-bool LangevinDynamics::projectPositions(Vectors& positions) {
+bool LangevinDynamics::projectPositions(Vectors& positions, const ExpressionParameters& parameters) {
     isAtStart = false;
-    return solver.projectPositions(positions, theta);
+    return solver.projectPositions(positions, parameters);
 }
 
 void LangevinDynamics::adoptParameters() {
     theta.values = motion.target;
+    motion.rest(theta);
 }
 
 void LangevinDynamics::begin(const Vectors& positions, const Vectors& velocities, const Vectors& forces,

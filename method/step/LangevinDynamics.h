@@ -68,7 +68,7 @@ public:
         return settings;
     }
 
-    bool projectPositions(std::vector<OpenMM::Vec3>& positions);
+    bool projectPositions(std::vector<OpenMM::Vec3>& positions, const ExpressionParameters& parameters);
     void begin(const std::vector<OpenMM::Vec3>& positions, const std::vector<OpenMM::Vec3>& velocities,
                const std::vector<OpenMM::Vec3>& forces, double groupEnergy);
     std::function<void()> remember();

@@ -49,7 +49,7 @@ void testProjectionOfChain(int bonds) {
                 VRattleRun dynamics(e.masses, {}, e.expressions);
                 dynamics.setSettings(fixedSteps(1e-3));
                 vector<Vec3> positions = e.positions;
-                ASSERT(dynamics.projectPositions(positions));
+                ASSERT(dynamics.projectPositions(positions, dynamics.getParameters()));
                 for (int i = 0; i < bonds; i++) {
                     const Vec3 r = positions[i] - positions[i + 1];
                     ASSERT_EQUAL_TOL(0.15, std::sqrt(r.dot(r)), 1e-8);

@@ -271,7 +271,7 @@ void testProjection(const Example& e) {
     vector<double> g(system.getNumConstraints());
     system.evaluateJacobian(positions, theta, jacobian);
     ASSERT(system.evaluate(positions, theta, g, jacobian) > 0.003);
-    ASSERT(dynamics.projectPositions(positions));
+    ASSERT(dynamics.projectPositions(positions, dynamics.getParameters()));
     system.evaluateJacobian(positions, theta, jacobian);
     ASSERT(system.evaluate(positions, theta, g, jacobian) <= 1e-10);
 }

@@ -77,7 +77,7 @@ Outcome run(const Example& e, const StepSettings& settings, int steps, const VRa
     for (size_t i = 0; i < positions.size(); i++)
         if (e.masses[i] > 0)
             positions[i] += Vec3(1e-4 * std::sin(i), 1e-4 * std::cos(3 * i), 0);
-    ASSERT(dynamics.projectPositions(positions));
+    ASSERT(dynamics.projectPositions(positions, dynamics.getParameters()));
     dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
     takeSteps(dynamics, steps);
     dynamics.reverse();

@@ -190,7 +190,7 @@ double referenceFor(LangevinDynamics& dynamics, int k) {
 
 void begin(LangevinDynamics& dynamics, const Example& e) {
     Vectors positions = e.positions;
-    dynamics.projectPositions(positions);
+    dynamics.projectPositions(positions, dynamics.getParameters());
     dynamics.begin(positions, e.velocities, forceAt(positions), 0);
 }
 
@@ -471,7 +471,7 @@ void testThreads() {
         settings.tolerance = 1e-9; // for the comb is long
         dynamics.setSettings(settings);
         Vectors positions = e.positions;
-        dynamics.projectPositions(positions);
+        dynamics.projectPositions(positions, dynamics.getParameters());
         dynamics.begin(positions, e.velocities, forcesAt(positions), 0);
         for (int i = 0; i < 4; i++) {
             Vectors forces;

@@ -182,6 +182,8 @@ public:
     }
     void requirePositions() override {
     }
+    void invalidateForces() override {
+    }
     void computeVirtualSites() override {
     }
     double computeForces(int, int) override {

@@ -25,18 +25,18 @@ const double NO_LIMIT = std::numeric_limits<double>::infinity();
 const int STEPS_BETWEEN_REORDERINGS = 250;
 const int MANY_STEPS = 1 << 20;
 
-// Takes note that forces and particles are no longer in the same order. Nothing else of ours depends on it: only identical molecules
+// Counts how often forces and particles may have got into another order. Nothing else of ours depends on it: only identical molecules
 // change places, and they have identical clusters.
 class ReorderingNote : public OpenMM::ComputeContext::ReorderListener {
 public:
-    explicit ReorderingNote(bool& note) : note(note) {
+    explicit ReorderingNote(int& count) : count(count) {
     }
     void execute() override {
-        note = true;
+        count++;
     }
 
 private:
-    bool& note;
+    int& count;
 };
 
 } // namespace
@@ -47,8 +47,8 @@ CommonRunDevice<Method>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::C
         Host(std::make_unique<ComputeVectors>(context, integrator), context.getSystem(), settings), context(context),
         compute(compute), actions(context, compute), expressionInfo(nullptr), state(), lastReport(), isOnDevice(false),
         hasBegun(false), isOnHost(true), areSettingsOnDevice(false), hasReport(false), numAsked(0),
-        stepsUntilLook(MANY_STEPS), lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), knownCount(0),
-        groupEnergy(0), hasForces(false), writeCount(0), areAtomsReordered(true), reorderedStep(0),
+        stepsUntilLook(MANY_STEPS), lastMaxTime(NO_LIMIT), settledTime(0), settledCount(0), groupEnergy(0),
+        hasForces(false), writeCount(0), numReorderings(0), orderReorderings(-1), reorderedStep(0),
         numDeviceRescues(0) {
     // Too late where the Context's other integrators have initialized it already: then molecules that differ in expressions alone may
     // change places on the device, and the host takes the steps.
@@ -62,7 +62,7 @@ CommonRunDevice<Method>::CommonRunDevice(OpenMM::ContextImpl& context, OpenMM::C
     if (areKnown && DeviceSteps::canTake(settings.expressions))
         steps = std::make_unique<DeviceSteps>(compute, method.getConstraintSystem().getLayout(), settings.expressions);
     ContextSelector selector(compute);
-    compute.addReorderListener(new ReorderingNote(areAtomsReordered)); // which belongs to the Context
+    compute.addReorderListener(new ReorderingNote(numReorderings)); // which belongs to the Context
 }
 
 // ------------------------------------------------------------------------------------------------ from one to the other
@@ -75,9 +75,9 @@ template <class Method> double CommonRunDevice<Method>::computeForces() {
     groupEnergy = Host::computeForces();
     hasForces = true;
     writeCount = getNumWrites();
-    if (areAtomsReordered)
+    if (areAtomsReordered())
         order = compute.getAtomIndex();
-    areAtomsReordered = false;
+    orderReorderings = numReorderings;
     return groupEnergy;
 }
 
@@ -111,7 +111,7 @@ template <class Method> void CommonRunDevice<Method>::correctMasses() {
 // move puts forces and the order of the atoms back.
 template <class Method> bool CommonRunDevice<Method>::areForcesValid() {
     return hasForces && writeCount == getNumWrites() && context.getLastForceGroups() == forceGroups &&
-           (!areAtomsReordered || compute.getAtomIndex() == order);
+           (!areAtomsReordered() || compute.getAtomIndex() == order);
 }
 
 template <class Method> void CommonRunDevice<Method>::ensureForces() {
@@ -192,7 +192,7 @@ template <class Method> void CommonRunDevice<Method>::step(double maxTime) {
     else
         Host::step(maxTime);
     hasStepped = isOnDevice;
-    knownCount = vectors->getStepCount();
+    stepMark = getStepMark();
 }
 
 template <class Method> void CommonRunDevice<Method>::stepOnDevice(double maxTime) {
@@ -235,7 +235,7 @@ template <class Method> void CommonRunDevice<Method>::reorderAtoms() {
     if (isDue)
         lastOffsets = compute.getPosCellOffsets();
     compute.reorderAtoms();
-    if (areAtomsReordered) {
+    if (areAtomsReordered()) {
         reorderedStep = numAsked;
         lastOrder = order;
     }
@@ -268,13 +268,13 @@ template <class Method> void CommonRunDevice<Method>::accept(const DeviceSteps::
     numDeviceRescues += report.numRescues;
     vectors->setTime(report.isShortened && areAllComplete ? lastMaxTime : settledTime + report.elapsed);
     vectors->setStepCount(settledCount + report.numSteps);
-    knownCount = settledCount + report.numSteps;
     numAsked = 0;
     lastReport = report;
     hasReport = areAllComplete;
     hasBegun = areAllComplete;
     if (!areAllComplete)
         hasForces = false;
+    stepMark = getStepMark();
 }
 
 template <class Method> void CommonRunDevice<Method>::settle() {
@@ -360,8 +360,11 @@ template <class Method> bool CommonRunDevice<Method>::updateState() {
     if (reach.hasThermostat && isOnDevice)
         steps->keepVelocities();
     haveActed = true;
+    const long long mark = getStepMark();
     try {
-        return actions.update(isOnDevice && hasBegun ? &steps->getControl() : nullptr);
+        const bool areForcesInvalid = actions.update(isOnDevice && hasBegun ? &steps->getControl() : nullptr);
+        stepMark += getStepMark() - mark; // a barostat that puts the order of the atoms back is no integrator
+        return areForcesInvalid;
     }
     catch (...) {
         settle();
@@ -376,8 +379,7 @@ template <class Method> RunDevice::Change CommonRunDevice<Method>::findChange() 
     haveActed = false;
     if (Host::isOtherBox())
         return RunDevice::Change::Box;
-    // Another integrator (of a CompoundIntegrator) has taken steps.
-    if (vectors->getStepCount() != knownCount)
+    if (haveOthersStepped())
         return RunDevice::Change::State;
     // A uniform motion is of no concern to constraints and their forces.
     const bool isOtherFrame = reach.movesFrame && doesFrameMatter();
@@ -388,6 +390,12 @@ template <class Method> RunDevice::Change CommonRunDevice<Method>::findChange() 
 // The Context keeps fewer digits than the host, and OpenMM loses some more when it wraps molecules into the box, in single precision.
 template <class Method> double CommonRunDevice<Method>::getPositionRounding() const {
     return compute.getUseDoublePrecision() ? 1e-12 : compute.getUseMixedPrecision() ? 1e-6 : 1e-5;
+}
+
+// Each integrator has OpenMM reorder the atoms in each of its steps, or count that step among those since they were; the step count of the
+// Context is the user's to set.
+template <class Method> long long CommonRunDevice<Method>::getStepMark() {
+    return ((long long) numReorderings << 32) + compute.getStepsSinceReorder();
 }
 
 template <class Method> unsigned long long CommonRunDevice<Method>::getFingerprint() {
@@ -412,7 +420,6 @@ template <class Method> void CommonRunDevice<Method>::start() {
         isOnHost = wasOnHost;
         throw;
     }
-    knownCount = vectors->getStepCount();
 }
 
 template <class Method> void CommonRunDevice<Method>::changeState() {
@@ -423,9 +430,39 @@ template <class Method> void CommonRunDevice<Method>::changeState() {
         Host::changeState();
         return;
     }
+    if (!expressions.empty() && haveOthersStepped()) {
+        takeTurn();
+        return;
+    }
     computeForces();
     changeOnDevice(Control::AllChanged);
     settle();
+}
+
+// Others know nothing of expressions, and may have left particles far from where these hold. The device finds the density, for it alone
+// has u before the change; then the state is the host's, for the Context keeps what others have left until a step is complete.
+template <class Method> void CommonRunDevice<Method>::takeTurn() {
+    const typename Host::Ahead left = {vectors->getPositions(), vectors->getVelocities()};
+    auto putBack = [&] {
+        vectors->setPositions(left.positions);
+        vectors->writeVelocities([&](Vectors& to) { to = left.velocities; }, true);
+        vectors->invalidateForces();
+    };
+    auto take = [&] {
+        method.adoptParameters();
+        const ExpressionParameters theta = method.getParameters();
+        Vectors positions = left.positions;
+        if (method.projectPositions(positions, theta))
+            Host::moveContext(positions);
+        steps->setParameters(method.getConstraintSystem().toGivenOrder(theta));
+        computeForces();
+        changeOnDevice(Control::AllChanged);
+        takeToHost();
+    };
+    isOnHost = false;
+    attempt(take, putBack);
+    putBack();
+    ahead = left;
 }
 
 template <class Method> void CommonRunDevice<Method>::changeForces() {
@@ -463,7 +500,7 @@ template <class Method> void CommonRunDevice<Method>::changeVelocities() {
 
 template <class Method> void CommonRunDevice<Method>::changeOnDevice(Control::Change change) {
     steps->change(groupEnergy, change);
-    knownCount = vectors->getStepCount();
+    stepMark = getStepMark();
     isChangePending = true;
     isOnHost = hasReport = false;
 }
@@ -572,7 +609,7 @@ template <class Method> const DeviceSteps::State* CommonRunDevice<Method>::findD
 // to the state before.
 template <class Method> void CommonRunDevice<Method>::save(RunState& run) {
     settle();
-    if (isOnDevice && !isOnHost && vectors->getStepCount() != knownCount)
+    if (isOnDevice && !isOnHost && haveOthersStepped())
         changeState();
     bringToHost();
     Host::save(run);
@@ -587,7 +624,6 @@ bool CommonRunDevice<Method>::resume(const RunState& run, const IntegratorSettin
         return false;
     isOnDevice = false;
     isOnHost = true;
-    knownCount = vectors->getStepCount();
     return true;
 }
 

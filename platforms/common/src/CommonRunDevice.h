@@ -67,13 +67,16 @@ protected:
     using Host::expressions;
     using Host::forceGroups;
     using Host::hasMassless;
+    using Host::haveOthersStepped;
     using Host::lastStep;
     using Host::masses;
     using Host::method;
     using Host::reach;
+    using Host::stepMark;
     using Host::vectors;
     double computeForces() override;
     double getPositionRounding() const override;
+    long long getStepMark() override;
     /** Whether the method's next step is one that the GPU can take: all of its numbers are known. */
     virtual bool canGoOnDevice() = 0;
     /** The settings in force, for the GPU. */
@@ -103,9 +106,13 @@ private:
     bool canStepOnDevice();
     bool areNumbersOnDevice();
     void correctMasses();
+    bool areAtomsReordered() const {
+        return numReorderings != orderReorderings;
+    }
     bool areForcesValid();
     void ensureForces();
     int getNumWrites() const;
+    void takeTurn();
     void changeOnDevice(Control::Change change);
     void resolveChange();
     void repeatActions();
@@ -135,12 +142,13 @@ private:
     int stepsUntilLook; // how many there may be
     double lastMaxTime; // of the last of them
     double settledTime;
-    long long settledCount, knownCount;
+    long long settledCount;
     double groupEnergy; // of the last forces
     bool hasForces;     // of the state, unless what follows says otherwise
     int writeCount;     // of positions, when they were computed
-    std::vector<int> order;  // of the atoms, likewise
-    bool areAtomsReordered; // perhaps, since then
+    int numReorderings;   // of the atoms, perhaps
+    std::vector<int> order; // the last one, when forces were computed
+    int orderReorderings;   // and their number then
     int reorderedStep; // of those asked for, the last after which the atoms were put into another order; 0 for none
     std::vector<int> lastOrder; // the one before
     std::vector<OpenMM::mm_int4> lastOffsets;

@@ -505,6 +505,11 @@ void DeviceSteps::launchEvaluate(int step, Control::Change change, bool isReport
     numLaunches++;
 }
 
+void DeviceSteps::setParameters(const ExpressionParameters& theta) {
+    OpenMM::ContextSelector selector(context);
+    expressions->setParameters(theta, stepSizeRead);
+}
+
 void DeviceSteps::moveParameters(const vector<ExpressionConstraint>& given) {
     if (expressions)
         expressions->moveParameters(given);
@@ -609,7 +614,7 @@ bool DeviceSteps::begin(const State& state, double energy, const ExpressionParam
     elapsedRead = 0;
     stepSizeRead = block[Control::StepSize];
     if (expressions && theta != nullptr)
-        expressions->setParameters(*theta, stepSizeRead);
+        setParameters(*theta);
     groupEnergy = energy;
     launchFinish(NO_STEP, 0, Control::AllChanged, false);
     launchEvaluate(NO_STEP, Control::NothingChanged, true);

@@ -90,6 +90,8 @@ public:
      * @return false if the constraints depend on each other or a monitor is no number
      */
     bool begin(const State& state, double groupEnergy, const ExpressionParameters* theta = nullptr);
+    /** Put such parameters of expressions in force. The steps before must have been read. */
+    void setParameters(const ExpressionParameters& theta);
     /** The next step leads to these parameters of expressions, all that were given. The steps before it must have been read. */
     void moveParameters(const std::vector<ExpressionConstraint>& given);
     /** In that order the parameters of expressions in the state that was read last, with the rates of the step that has led there. */

@@ -29,6 +29,9 @@ public:
     void requirePositions() override {
         context.calcForcesAndEnergy(false, false, 0); // of no group, which computes nothing
     }
+    void invalidateForces() override {
+        context.getLastForceGroups() = 0; // they are of no group, as everybody sees who would use them
+    }
     void computeVirtualSites() override {
         context.computeVirtualSites();
     }
