@@ -582,7 +582,12 @@ template <class Method> double CommonRunDevice<Method>::computeKineticEnergy() {
     return compute.getIntegrationUtilities().computeKineticEnergy(0);
 }
 
+// Which reporters ask for.
 template <class Method> double CommonRunDevice<Method>::computeHalfStepKineticEnergy() {
+    if (areNumbersOnDevice()) {
+        ensureForces();
+        return steps->computeHalfStepKineticEnergy();
+    }
     bringToHost();
     return Host::computeHalfStepKineticEnergy();
 }

@@ -587,6 +587,30 @@ vector<double> DeviceSteps::getExpressionMultipliers() {
     return result;
 }
 
+// P (v - h/2 M^-1 F) is what finishStep makes of half a kick backwards, along with numbers of a state that nobody is in.
+double DeviceSteps::computeHalfStepKineticEnergy() {
+    OpenMM::ContextSelector selector(context);
+    vector<OpenMM::ArrayInterface*> written = {&context.getVelm(), &partials, &multipliers, &largeMultipliers};
+    if (expressions)
+        written.push_back(&expressions->getMultiplierArray());
+    auto forWritten = [&](auto copy) {
+        for (size_t i = 0; i < written.size(); i++)
+            if (written[i]->isInitialized())
+                copy(*written[i], beforeLook[i]);
+    };
+    forWritten([&](OpenMM::ArrayInterface& array, OpenMM::ComputeArray& kept) {
+        if (!kept.isInitialized())
+            kept.initialize(context, array.getSize(), array.getElementSize(), "vrattleBeforeLook");
+        else if (kept.getSize() != array.getSize())
+            kept.resize(array.getSize());
+        array.copyTo(kept);
+    });
+    launchFinish(stepNumber, -0.5, Control::NothingChanged, true);
+    const double energy = context.getIntegrationUtilities().computeKineticEnergy(0);
+    forWritten([](OpenMM::ArrayInterface& array, OpenMM::ComputeArray& kept) { kept.copyTo(array); });
+    return energy;
+}
+
 bool DeviceSteps::begin(const State& state, double energy, const ExpressionParameters* theta) {
     OpenMM::ContextSelector selector(context);
     vector<double> block(program->getControlSize(), 0.0);

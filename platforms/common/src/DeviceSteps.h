@@ -128,6 +128,11 @@ public:
     std::vector<double> getMultipliers();
     /** The same of the expressions alone. */
     std::vector<double> getExpressionMultipliers();
+    /**
+     * In Langevin dynamics: the kinetic energy of the velocities half a step before the state that was read last, which must be the one
+     * there is, with its forces. The state is the same afterwards, to the last bit. Waits for the device, once.
+     */
+    double computeHalfStepKineticEnergy();
     /** Whether a step has failed. Waits for the device. */
     bool hasFailed();
     /** The number of iterations of the cluster that has needed most, since the beginning. */
@@ -214,6 +219,7 @@ private:
     OpenMM::ComputeArray oldPositions, oldVelocities, failure, iterationCounts, noise;
     OpenMM::ComputeArray lastForces, lastSquares, lastVelocities; // of automatic step control
     bool areVelocitiesKept;
+    OpenMM::ComputeArray beforeLook[5]; // what computeHalfStepKineticEnergy() puts back
     OpenMM::ComputeArray largeTables, largePieces, largeRows, largeRowLengths, largeAtoms, largeJoints,
         largeJointLengths;
     OpenMM::ComputeArray largeMultipliers, largeFactors, largeWork, largeExchange, largePhases, largeIterations;

@@ -303,6 +303,13 @@ void testGetters() {
     require("getReferenceMonitorValue()", 0, 0, [&] { langevin.getReferenceMonitorValue(); });
     require("getNumForceEvaluations()", 0, 0, [&] { langevin.getNumForceEvaluations(); });
     require("getNumSolverIterations()", 1, 1024, [&] { langevin.getNumSolverIterations(); });
+    // Two numbers for the energies, the kinetic one that of the half step, after which all is as it was.
+    const vector<double> multipliers = langevin.getMultipliers();
+    const State before = context.getState(State::Positions | State::Velocities);
+    require("getState(Energy)", 2, 24, [&] { context.getState(State::Energy); });
+    const State after = context.getState(State::Positions | State::Velocities);
+    ASSERT(before.getPositions() == after.getPositions() && before.getVelocities() == after.getVelocities());
+    ASSERT(multipliers == langevin.getMultipliers());
     require("getNumSubstepped()", 0, 0, [&] { langevin.getNumSubstepped(); });
     require("getLargestSubsteps()", 0, 0, [&] { langevin.getLargestSubsteps(); });
 }
