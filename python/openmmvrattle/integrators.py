@@ -35,6 +35,7 @@ __all__ = ["ConstrainedIntegrator", "VariableStepRattleIntegrator", "VariableSte
 _TIME = unit.picosecond
 _FRICTION = unit.picosecond**-1
 _MANY_SHORT_STEPS = 1000
+_STEPS_AT_ONCE = 1000  # after which Python can interrupt, and warn
 _MULTIPLIER = unit.kilojoule_per_mole / unit.nanometer**2
 
 
@@ -389,7 +390,7 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         self.__dict__.update(attributes)
 
     def step(self, steps: int) -> None:
-        """Advance the simulation by a number of steps.
+        """Advance the simulation by a number of steps. KeyboardInterrupt ends it within 1000 of them.
 
         Parameters
         ----------
@@ -401,7 +402,11 @@ class ConstrainedIntegrator(vrattle.ConstrainedIntegrator):
         OpenMMException
             if there is no Context, or a step cannot be completed; the Context is then in the state before that step
         """
-        super().step(integer(steps, "steps"))
+        remaining = integer(steps, "steps")
+        while remaining > _STEPS_AT_ONCE:
+            super().step(_STEPS_AT_ONCE)
+            remaining -= _STEPS_AT_ONCE
+        super().step(remaining)
 
 
 class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRattleIntegrator):
@@ -1089,7 +1094,7 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         return super().getNumShortSteps()
 
     def step(self, steps: int) -> None:
-        """Advance the simulation by a number of steps.
+        """Advance the simulation by a number of steps. KeyboardInterrupt ends it within 1000 of them.
 
         Parameters
         ----------
@@ -1103,9 +1108,9 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
         """
         remaining = integer(steps, "steps")
         self._compare_with_what_is_usual()
-        while self.isAutomatic() and remaining > _MANY_SHORT_STEPS:
-            super().step(_MANY_SHORT_STEPS)
-            remaining -= _MANY_SHORT_STEPS
+        while remaining > _STEPS_AT_ONCE:
+            super().step(_STEPS_AT_ONCE)
+            remaining -= _STEPS_AT_ONCE
             self._warn_of_short_steps()
         super().step(remaining)
         self._warn_of_short_steps()

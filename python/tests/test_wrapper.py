@@ -8,13 +8,14 @@ What the integrator computes is tested elsewhere; here it matters that Python pa
 import gc
 import inspect
 import math
+import signal
 import threading
 
 import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmmvrattle import VariableStepRattleIntegrator
+from openmmvrattle import VariableStepRattleIntegrator, VariableStepRattleLangevinIntegrator
 from openmmvrattle.integrators import ConstrainedIntegrator
 
 pytestmark = pytest.mark.filterwarnings("ignore:.etNormOrder:DeprecationWarning")
@@ -482,6 +483,32 @@ def test_steps_let_other_threads_run():
         thread.join(timeout=0.001)
     assert counts > 3
     assert context.getStepCount() == 50001
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: VariableStepRattleIntegrator(0.001),
+        lambda: VariableStepRattleIntegrator(0.001, automatic=True),
+        lambda: VariableStepRattleLangevinIntegrator(300, 1, 0.001),
+    ],
+)
+def test_a_long_run_can_be_interrupted(make):
+    integrator = make()
+    context = make_context(integrator)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    timer = threading.Timer(0.1, lambda: signal.raise_signal(signal.SIGINT))
+    try:
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            integrator.step(2**31 - 1)
+    finally:
+        timer.join()
+        signal.signal(signal.SIGINT, before)
+    steps = context.getStepCount()
+    assert steps > 0
+    integrator.step(1)
+    assert context.getStepCount() == steps + 1
 
 
 def test_forces_written_in_python():
