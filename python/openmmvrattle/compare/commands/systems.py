@@ -9,7 +9,6 @@ import difflib
 import inspect
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
 from ...custom.settings import MONITOR_KINDS as MONITORS
@@ -156,9 +155,3 @@ def monitors_from(text: str) -> tuple[MonitorSettings, ...]:
             raise UsageError(f"weight and power of the monitor '{part}' must be positive.")
         monitors.append(settings)
     return tuple(monitors)
-
-
-def with_time(system: TestSystem, total_time: float, evaluations: int) -> TestSystem:
-    """A system with another length and number of force evaluations."""
-    settings = replace(system.settings, total_time=total_time, force_evaluations=evaluations)
-    return replace(system, settings=settings)
