@@ -71,7 +71,7 @@ void VRattleRun::putBack(const Kept& kept) {
     solver.setSettings(settings.stepSize, settings.tolerance);
     constraints.moveTo(now.q, now.theta, now.force);
     control = &controlOf(settings);
-    control->applySettings(settings);
+    control->changeSettings(settings, kept.memory.references, StepControl::Nothing);
     setMemory(kept.memory);
 }
 

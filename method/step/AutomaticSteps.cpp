@@ -110,13 +110,10 @@ std::string AutomaticSteps::explainStep() const {
     return text.str();
 }
 
-ConstraintSolver::Observer* AutomaticSteps::observe(ConstraintSolver::OnStep& end) {
-    forceSquares.observe(end.forces);
-    return &forceSquares;
-}
-
-bool AutomaticSteps::measure() {
-    const StepState& next = solver.next;
+bool AutomaticSteps::finish() {
+    StepState& next = solver.next;
+    forceSquares.observe(next.force);
+    constraints.finish(next.end(0.5 * solver.size), &forceSquares);
     forceSquares.find(next.force);
     control.measure(stateOf(next), next.w, solver.size, now.force);
     return true;

@@ -21,19 +21,18 @@ public:
     std::vector<double> getValues() const override;
     std::vector<double> getReferences() const override;
     void setReferences(const std::vector<double>& references) override;
-    void applySettings(const StepSettings& newSettings) override;
     void changeSettings(const StepSettings& newSettings, const std::vector<double>& references,
                         SettingsChange change) override;
     void change(ChangeKind kind, double part) override;
     void reverse() override;
     bool start() override;
     void solve() override;
-    ConstraintSolver::Observer* observe(ConstraintSolver::OnStep& end) override;
-    bool measure() override;
+    bool finish() override;
     void accept() override;
     void abandon() override;
 
 private:
+    void applySettings(const StepSettings& newSettings);
     std::string explainStep() const override;
     static AutomaticControl::State stateOf(const StepState& state);
     AutomaticControl control;

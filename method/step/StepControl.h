@@ -57,9 +57,7 @@ public:
     void setMemory(const StepMemory& memory) {
         static_cast<StepMemory&>(*this) = memory;
     }
-    /** Take over settings and nothing else: where memory and references are those that belong to them. */
-    virtual void applySettings(const StepSettings& newSettings) = 0;
-    /** Take over settings, with the references that belong to them. Where there is a state, the density goes on if it can. */
+    /** Take over settings, with the references that belong to them. Where these change at a state, the density goes on if it can. */
     virtual void changeSettings(const StepSettings& newSettings, const std::vector<double>& references,
                                 SettingsChange change) = 0;
 
@@ -92,15 +90,13 @@ public:
     [[noreturn]] void throwNotConverged() {
         throw StepFailure(solver.explainFailure() + explainStep());
     }
-    /** The forces at the end of the step in progress are known: what is to be done along with the solution there, or found with it. */
-    virtual ConstraintSolver::Observer* observe(ConstraintSolver::OnStep& end) = 0;
     /**
-     * Look at the end of the step; nothing is taken over.
+     * The forces at the end of the step are known: complete it (3.12)-(3.13) and measure there; nothing is taken over.
      *
      * @return whether the step stands; if not, the first density is now known better
-     * @throws StepFailure    if a monitor is not defined there
+     * @throws StepFailure    if the constraints have become dependent, or a monitor is not defined there
      */
-    virtual bool measure() = 0;
+    virtual bool finish() = 0;
     /** Take over what has been measured: the state is that of the end now, and the one before is what was next. */
     virtual void accept() = 0;
     /** Or the step has failed. */

@@ -62,7 +62,7 @@ bool StepMonitor::useVelocities(const vector<Term>& terms) {
 
 StepMonitor::StepMonitor(ConstraintSolver& solver) :
         solver(solver), system(solver.getSystem()), forceSquares(solver), seen(solver), seenHalf(solver),
-        trial{Values(system.getNumConstraints()), Values(system.getNumConstraints())} {
+        atHalfStep{Values(system.getNumConstraints()), Values(system.getNumConstraints())} {
 }
 
 void StepMonitor::setTerms(const vector<Term>& newTerms, const StepDensity& newBounds) {
@@ -77,24 +77,6 @@ void StepMonitor::setTerms(const vector<Term>& newTerms, const StepDensity& newB
     seen.setSquaresWanted(areSquaresWanted);
     seenHalf.setSquaresWanted(areSquaresWanted);
 }
-
-// ---------------------------------------------------------------------------------------------------- what is observed
-
-ConstraintSolver::Coupled StepMonitor::observeTrial(const ExpressionParameters& theta) {
-    seen.observe(trial.multipliers, trial.rightSide);
-    seenHalf.ignore();
-    return {theta, trial.multipliers, trial.rightSide};
-}
-
-void StepMonitor::observe(const ConstraintSolver::OnStep& end) {
-    forceSquares.observe(end.forces);
-    seen.observe(end.multipliers, end.rightSide);
-    seenHalf.ignore();
-    if (end.atHalfStep != nullptr)
-        seenHalf.observe(end.atHalfStep->multipliers, end.atHalfStep->rightSide);
-}
-
-// ---------------------------------------------------------------------------------------------------------- the values
 
 // The square of what is a sum of squares, and else the norm itself, unless that takes velocities too.
 void StepMonitor::takeForces(StepState& state) {
@@ -116,39 +98,51 @@ void StepMonitor::takeForces(StepState& state) {
     }
 }
 
-void StepMonitor::evaluate(StepState& state) {
-    takeForces(state);
-    state.values = evaluate(state, state.v, seen);
+void StepMonitor::finish(StepState& end, double kick, bool withHalfStep) {
+    forceSquares.observe(end.force);
+    seen.observe(end.lambda, end.rightSide);
+    if (withHalfStep)
+        seenHalf.observe(atHalfStep.multipliers, atHalfStep.rightSide);
+    else
+        seenHalf.ignore();
+    solver.finish(end.end(kick, withHalfStep ? &atHalfStep : nullptr), this);
+    takeForces(end);
+    evaluate(end, end.v, seen, end.values);
+    if (withHalfStep)
+        evaluate(end, end.w, seenHalf, end.halfStepValues);
+    requireValid(end.values);
 }
 
 void StepMonitor::look(StepState& state, bool areForcesOthers) {
     seen.look(state.lambda, state.rightSide);
     if (areForcesOthers)
         takeForces(state);
-    state.values = evaluate(state, state.v, seen);
-}
-
-const vector<double>& StepMonitor::evaluateHalfStep(const StepState& state) {
-    return evaluate(state, state.w, seenHalf);
-}
-
-const vector<double>& StepMonitor::evaluateTrial(const StepState& state, const Vectors& v) {
-    return evaluate(state, v, seen);
+    evaluate(state, state.v, seen, state.values);
 }
 
 const vector<double>& StepMonitor::evaluateAt(const StepState& state, const Vectors& v,
                                               const ExpressionParameters& theta) {
-    solver.findMultipliers(v, theta, trial.multipliers, trial.rightSide); // (4.3)
-    seen.look(trial.multipliers, trial.rightSide);
-    return evaluate(state, v, seen);
+    solver.findMultipliers(v, theta, atHalfStep.multipliers, atHalfStep.rightSide); // (4.3)
+    seen.look(atHalfStep.multipliers, atHalfStep.rightSide);
+    evaluate(state, v, seen, trialValues);
+    return trialValues;
 }
 
-const vector<double>& StepMonitor::evaluate(const StepState& state, const Vectors& v,
-                                            const MultiplierSquares& squares) {
+double StepMonitor::coupledPass(const StepState& state, const ConstraintSolver::Trial& trial,
+                                const ExpressionParameters& theta, const ConstraintSolver::Guess* start,
+                                double& constraintError) {
+    seen.observe(atHalfStep.multipliers, atHalfStep.rightSide);
+    seenHalf.ignore();
+    constraintError = solver.coupledPass(trial, {theta, atHalfStep.multipliers, atHalfStep.rightSide}, start, this);
+    evaluate(state, trial.velocities, seen, trialValues);
+    return combine(trialValues);
+}
+
+void StepMonitor::evaluate(const StepState& state, const Vectors& v, const MultiplierSquares& squares, Values& found) {
     const double constraintForceSquared = squares.getWeightedSum(), multipliersSquared = squares.getSum();
     const int numParticles = system.getNumParticles();
     const vector<double>& masses = system.getMasses();
-    values.resize(terms.size());
+    found.resize(terms.size());
     for (size_t k = 0; k < terms.size(); k++) {
         const Parts parts = PARTS[terms[k].kind];
         const double forcePart = state.forceParts[k];
@@ -156,19 +150,18 @@ const vector<double>& StepMonitor::evaluate(const StepState& state, const Vector
             return masses[i] > 0 ? (parts.velocity == Mass ? masses[i] : 1.0) * v[i].dot(v[i]) : 0.0;
         };
         if (parts.norm == Square)
-            values[k] = std::sqrt((parts.constraintForce ? constraintForceSquared : 0.0) +
-                                  (parts.multipliers ? multipliersSquared : 0.0) + forcePart +
-                                  (parts.velocity != No ? solver.sum(numParticles, square) : 0.0));
+            found[k] = std::sqrt((parts.constraintForce ? constraintForceSquared : 0.0) +
+                                 (parts.multipliers ? multipliersSquared : 0.0) + forcePart +
+                                 (parts.velocity != No ? solver.sum(numParticles, square) : 0.0));
         else if (parts.norm == Power && parts.multipliers)
-            values[k] =
+            found[k] =
                 solver.pNorm(system.getNumConstraints(), terms[k].order, [&](int j) { return squares.sizeOf(j); });
         else if (parts.norm == Largest && parts.velocity != No)
-            values[k] = std::sqrt(solver.largest(
+            found[k] = std::sqrt(solver.largest(
                 numParticles, [&](int i) { return square(i) + forceSquares.squareOf(state.force[i], i); }));
         else
-            values[k] = forcePart;
+            found[k] = forcePart;
     }
-    return values;
 }
 
 void StepMonitor::requireValid(const Values& checked) const {

@@ -9,10 +9,28 @@
 #include "constraints/MultiplierSquares.h"
 #include "openmm/Vec3.h"
 #include "step/StepDensity.h"
-#include "step/StepState.h"
 #include <vector>
 
 namespace OpenMMVRattle {
+
+/** An on-step state, and what is known of the step that has led to it. */
+struct StepState {
+    explicit StepState(const ConstraintSystem& system) :
+            q(system.getNumParticles()), v(q), w(q), force(q), theta(system.getGivenParameters()),
+            lambda(system.getNumConstraints()), rightSide(lambda), offset{lambda, lambda} {
+    }
+    /** As the end of a step that is still to be kicked (ps), which its half-step velocities have led to. */
+    ConstraintSolver::OnStep end(double kick, ConstraintSolver::HalfStep* atHalfStep = nullptr) {
+        return {q, w, force, theta, kick, v, lambda, rightSide, atHalfStep};
+    }
+    std::vector<OpenMM::Vec3> q, v, w, force; // q[n], M^-1 p[n], M^-1 p[n-1/2] and F(q[n])
+    ExpressionParameters theta;               // theta[n], with the rates of the step
+    std::vector<double> lambda, rightSide;    // Lambda(q[n],p[n]) and K Lambda
+    ConstraintSolver::Offset offset;          // lambda and Lambda of the last regular step
+    double groupEnergy = 0;                   // of the monitor's force group at q[n]
+    std::vector<double> values, forceParts;   // U_k(q[n],p[n]), and what of each the forces alone are
+    std::vector<double> halfStepValues;       // U_k(q[n],p[n-1/2]), if they have been found
+};
 
 /**
  * The monitors U_k(q,p) of docs/method.md, section 4, and their combination
@@ -56,18 +74,19 @@ public:
     void setTerms(const std::vector<Term>& newTerms, const StepDensity& newBounds);
     Values references; // U_k,ref in force, 0 while they are not known
 
-    /** Let this be the solver's observer in a pass for trial velocities, which finds the multipliers of these; */
-    ConstraintSolver::Coupled observeTrial(const ExpressionParameters& theta);
-    /** or in that which completes a step. */
-    void observe(const ConstraintSolver::OnStep& end);
-    /** U_k at the state that has been observed so, or, with what the forces are of it if they are others, at one that nobody has. */
-    void evaluate(StepState& state);
+    /**
+     * Complete a step (3.12)-(3.13), and find U_k there, if it is wanted at the half-step velocities too.
+     *
+     * @throws StepFailure    if that cannot be done, or U_k is not defined there
+     */
+    void finish(StepState& end, double kick, bool withHalfStep);
+    /** U_k at a state for which that has not been done; what the forces are of it is found anew if they are others. */
     void look(StepState& state, bool areForcesOthers);
-    /** U_k at its half-step velocities, after evaluate(). This and what follows holds until the next of them. */
-    const Values& evaluateHalfStep(const StepState& state);
-    /** U_k at a state but for its velocities, which are those of the trial that has been observed, or of nobody. */
-    const Values& evaluateTrial(const StepState& state, const Vectors& v);
+    /** U_k at its positions for other velocities, and theta with other rates; it holds until the next call of this or the following. */
     const Values& evaluateAt(const StepState& state, const Vectors& v, const ExpressionParameters& theta);
+    /** A coupled pass from a state; returns u for the velocities that it finds. */
+    double coupledPass(const StepState& state, const ConstraintSolver::Trial& trial, const ExpressionParameters& theta,
+                       const ConstraintSolver::Guess* start, double& constraintError);
     /** @throws StepFailure    if a value is not a finite number, or negative */
     void requireValid(const Values& checked) const;
     /**
@@ -91,7 +110,7 @@ private:
         seenHalf.seeConstraints(range, first, end);
     }
     void takeForces(StepState& state);
-    const Values& evaluate(const StepState& state, const Vectors& v, const MultiplierSquares& squares);
+    void evaluate(const StepState& state, const Vectors& v, const MultiplierSquares& squares, Values& found);
     double combineUnbounded(const Values& of) const;
     ConstraintSolver& solver;
     const ConstraintSystem& system;
@@ -99,8 +118,8 @@ private:
     StepDensity bounds;
     ForceSquares forceSquares;
     MultiplierSquares seen, seenHalf;
-    ConstraintSolver::HalfStep trial;
-    Values values;
+    ConstraintSolver::HalfStep atHalfStep; // at whatever velocities but those of the state
+    Values trialValues;
 };
 
 } // namespace OpenMMVRattle

@@ -29,8 +29,7 @@ const double SMALLEST_SLOPE = 0.1, LARGEST_FACTOR = 4, FARTHEST = 100;
 
 StepSolver::StepSolver(ConstraintSolver& constraints, const StepState& now) :
         motion(constraints.getSystem()), jump(-1), next(constraints.getSystem()), kind(First), size(0),
-        constraints(constraints), now(now), h(0), tolerance(0), densityTolerance(0), isFromOnStep(false), lastDrift(0),
-        lastSolved(next.lambda) {
+        constraints(constraints), now(now), h(0), tolerance(0), densityTolerance(0), lastSolved(next.lambda) {
 }
 
 void StepSolver::setSettings(double stepSize, double newTolerance) {
@@ -50,14 +49,14 @@ void StepSolver::findJump(double rho) {
     jump = motion.findJump(constraints, now.v, now.theta, h / rho, next.v);
 }
 
-ConstraintSolver::Trial StepSolver::trialTo(double kick, double drift, const vector<Vec3>& start) {
-    lastDrift = drift;
-    isFromOnStep = &start == &now.v;
-    return {start, kick, drift, next.theta, next.q, next.w, next.offset.found};
+ConstraintSolver::Trial StepSolver::trialOf(Kind newKind, double kick, double drift) {
+    kind = newKind;
+    size = drift;
+    return {kind == Regular ? now.w : now.v, kick, drift, next.theta, next.q, next.w, next.offset.found};
 }
 
 ConstraintSolver::Trial StepSolver::regularTrial(double rho, double rhoNext) {
-    return trialTo(0.5 * (h / rho + h / rhoNext), h / rhoNext, now.w);
+    return trialOf(Regular, 0.5 * (h / rho + h / rhoNext), h / rhoNext);
 }
 
 // Lambda(q,p) agrees with lambda to O(h^2); what they differed by in the last step makes that O(h^3).
@@ -69,8 +68,9 @@ bool StepSolver::solve(double rho, double rhoNext) {
     return constraints.solvePositions(regularTrial(rho, rhoNext), regularGuess());
 }
 
-bool StepSolver::solveFromOnStep(double stepSize) {
-    return constraints.solvePositions(trialTo(0.5 * stepSize, stepSize, now.v), {now.lambda, nullptr, ON_STEP_MARGIN});
+bool StepSolver::solveFromOnStep(Kind newKind, double stepSize) {
+    return constraints.solvePositions(trialOf(newKind, 0.5 * stepSize, stepSize),
+                                      {now.lambda, nullptr, ON_STEP_MARGIN});
 }
 
 bool StepSolver::solveBackwards(double stepSize, StepState& back) {
@@ -81,8 +81,7 @@ bool StepSolver::solveBackwards(double stepSize, StepState& back) {
 }
 
 std::string StepSolver::explainFailure() {
-    const vector<Vec3>& start = isFromOnStep ? now.v : now.w;
-    std::string reason = constraints.explainFailure(trialTo(0.0, lastDrift, start));
+    std::string reason = constraints.explainFailure(trialOf(kind, 0.0, size));
     if (motion.isMoving())
         reason += "; parameters of constraints have been changed for this step, so move them by less at a time";
     return reason;
@@ -112,9 +111,10 @@ bool StepSolver::solveByChord(StepMonitor& monitor, const DensityEquation& equat
     for (int pass = 0; pass <= MAX_COUPLED_PASSES && rhoNext > 0; pass++) {
         const ConstraintSolver::Trial trial = regularTrial(equation.rho, rhoNext);
         const ConstraintSolver::Guess start = regularGuess();
-        const double constraintError = constraints.coupledPass(trial, monitor.observeTrial(motion.atStart(trial.drift)),
-                                                               pass == 0 ? &start : nullptr, &monitor);
-        const double mismatch = rhoNext - monitor.combine(monitor.evaluateTrial(now, next.w)) + equation.known;
+        double constraintError;
+        const double u =
+            monitor.coupledPass(now, trial, motion.atStart(size), pass == 0 ? &start : nullptr, constraintError);
+        const double mismatch = rhoNext - u + equation.known;
         const double error = std::max(constraintError / (REGULAR_MARGIN * tolerance),
                                       std::fabs(mismatch) / (densityTolerance * (rhoNext + equation.rho)));
         if (pass > 0 && error <= 1)
@@ -145,7 +145,7 @@ bool StepSolver::searchDensity(StepMonitor& monitor, const DensityEquation& equa
         if (constraints.solvePositions(regularTrial(equation.rho, rhoNext), start)) {
             isSolved = true;
             lastSolved = next.offset.found;
-            const vector<double>& values = monitor.evaluateAt(now, next.w, motion.atStart(lastDrift));
+            const vector<double>& values = monitor.evaluateAt(now, next.w, motion.atStart(size));
             mismatch = rhoNext - monitor.combine(values) + equation.known;
             const double error = std::fabs(mismatch) / (rhoNext + equation.rho);
             const bool isSlow = !(std::fabs(mismatch) < SLOW_CONVERGENCE * std::fabs(lastMismatch));

@@ -8,7 +8,6 @@
 #include "constraints/ParameterMotion.h"
 #include "openmm/Vec3.h"
 #include "step/StepMonitor.h"
-#include "step/StepState.h"
 #include <string>
 #include <vector>
 
@@ -34,9 +33,9 @@ public:
         jump; // the part of the kinetic energy that is in it; then next has the new velocities. Negative if there is none
     /** Solve (3.9)-(3.11) for a regular step, from p[n-1/2] and rho = rho[n-1/2]; returns whether that is done. */
     bool solve(double rho, double rhoNext);
-    /** The same for a step of plain RATTLE from the on-step state. */
-    bool solveFromOnStep(double stepSize);
-    /** The same backwards, from parameters that move at the same rates. */
+    /** The same for a step of plain RATTLE from the on-step state, which is of another kind. */
+    bool solveFromOnStep(Kind newKind, double stepSize);
+    /** A step like that one backwards, from parameters that move at the same rates. */
     bool solveBackwards(double stepSize, StepState& back);
     /** What (3.14) needs that does not change in a step. */
     struct DensityEquation {
@@ -50,7 +49,7 @@ public:
     /** Say why the last of these failed. */
     std::string explainFailure();
 
-    /** The step in progress: q[n+1], w[n+1/2], theta[n+1] and lambda[n] are found here, the rest of the state at its end later. */
+    /** The step that was last tried: q[n+1], w[n+1/2], theta[n+1] and lambda[n] are found here, the rest of the state at its end later. */
     StepState next;
     Kind kind;
     double size; // ps
@@ -58,7 +57,7 @@ public:
     void accept(StepState& last);
 
 private:
-    ConstraintSolver::Trial trialTo(double kick, double drift, const std::vector<OpenMM::Vec3>& start);
+    ConstraintSolver::Trial trialOf(Kind newKind, double kick, double drift);
     ConstraintSolver::Trial regularTrial(double rho, double rhoNext);
     ConstraintSolver::Guess regularGuess() const;
     bool solveByChord(StepMonitor& monitor, const DensityEquation& equation, double& rhoNext);
@@ -66,8 +65,6 @@ private:
     ConstraintSolver& constraints;
     const StepState& now;
     double h, tolerance, densityTolerance;
-    bool isFromOnStep;
-    double lastDrift; // of the last trial
     std::vector<double> lastSolved; // lambda in the search for a density
 };
 

@@ -57,7 +57,7 @@ void VRattleDynamics::takeOver(const vector<Vec3>& positions, const vector<Vec3>
     solver.next.q = positions;
     now.w = solver.next.w = solver.next.v = velocities;
     now.offset.found = now.offset.expected;
-    constraints.finish({now.q, velocities, now.force, now.theta, 0.0, now.v, now.lambda, now.rightSide, nullptr});
+    constraints.finish(now.end(0.0));
 }
 
 // p[n-1/2] = p[n] + (h/(2 rho)) (grad V + G^T Lambda)   (docs/method.md, section 7)
@@ -76,16 +76,14 @@ double VRattleDynamics::step(double maxStep) {
         solver.findJump(control->getDensity());
     else if (control->start())
         formHalfStepVelocities();
-    solver.kind = control->hasStarted() ? StepSolver::Regular : StepSolver::First;
     control->solve(); // (3.9)-(3.11), (3.14)
     const double full = settings.stepSize / control->getNextDensity();
     if (!std::isfinite(full))
         throw StepFailure("the monitor is zero and there is no maximum step size; set one");
     const bool isShortened = full > maxStep || std::fabs(full - maxStep) <= SLIVER * full;
-    solver.size = isShortened ? maxStep : full;
-    if (isShortened)
-        solver.kind = StepSolver::Shortened;
-    if (solver.kind != StepSolver::Regular && !solver.solveFromOnStep(solver.size))
+    const bool isDone = isShortened ? solver.solveFromOnStep(StepSolver::Shortened, maxStep)
+                                    : control->hasStarted() || solver.solveFromOnStep(StepSolver::First, full);
+    if (!isDone)
         control->throwNotConverged();
     solver.motion.setRates(solver.next.theta, solver.size);
     return solver.size;
@@ -95,10 +93,7 @@ bool VRattleDynamics::finish(vector<Vec3>& forces, double energy) {
     StepState& next = solver.next;
     next.force.swap(forces);
     next.groupEnergy = energy;
-    ConstraintSolver::OnStep end = {next.q, next.w,      next.force,     next.theta, 0.5 * solver.size,
-                                    next.v, next.lambda, next.rightSide, nullptr};
-    constraints.finish(end, control->observe(end)); // (3.12)-(3.13)
-    if (!control->measure())
+    if (!control->finish()) // (3.12)-(3.13)
         return false;
     // From here on nothing fails.
     constraints.endStep();

@@ -9,7 +9,6 @@
 #include "step/AutomaticSteps.h"
 #include "step/MonitorControl.h"
 #include "step/StepSolver.h"
-#include "step/StepState.h"
 #include <vector>
 
 namespace OpenMMVRattle {

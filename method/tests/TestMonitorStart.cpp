@@ -1,7 +1,7 @@
 // OpenMM-VRATTLE: time-reversible variable steps for constrained dynamics.
 // SPDX-License-Identifier: MIT
 
-// MonitorStart: the first step of a sequence of densities, and what it must not depend on.
+// MonitorControl: the first step of a sequence of densities, and what it must not depend on.
 
 #include "TestSupport.h"
 #include "run/VRattleRun.h"
