@@ -15,6 +15,8 @@ namespace {
 
 // What changes by more than this factor within the first step, or where the reference would be others by more, is not resolved.
 const double LARGEST_CHANGE = 2;
+// What grows by more than this factor was all but zero before; what starts at rest is four times larger after two steps than after one.
+const double LARGEST_GROWTH = 5;
 // A density that differs by no more is the same.
 const double DENSITY_ROUNDING = 1e-12;
 // Of the scale of references: the other one to begin with, and what is left of the mismatch where it is found, or will do.
@@ -271,6 +273,13 @@ bool MonitorControl::stepBack() {
 // The step stands where it had the density of the smooth start, or the references are now such that it had.
 bool MonitorControl::findSmoothStart() {
     const vector<double>& ahead = solver.next.values;
+    for (size_t k = 0; k < ahead.size(); k++) {
+        const bool isGrowing = monitor.references[k] == 0 && ahead[k] > LARGEST_GROWTH * startValues[k];
+        isNegligible[k] = isNegligible[k] || isGrowing;
+        isCalm = isCalm || isGrowing;
+    }
+    if (isCalm)
+        return true;
     referencesBefore = monitor.references;
     for (size_t k = 0; k < ahead.size(); k++)
         if (referencesBefore[k] == 0)

@@ -24,7 +24,7 @@ namespace OpenMMVRattle {
  *
  * A monitor that is zero at the start, but for rounding, asks for nothing and is no measure of what comes. As long as all are so, or
  * one that has no reference value, the start is calm: steps are single ones of plain RATTLE, and the sequence of densities starts
- * after them.
+ * after them. So it is while one without a reference value grows several times in a step, as at a minimum of the energy.
  */
 class MonitorControl : public StepControl {
 public:

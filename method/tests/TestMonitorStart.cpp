@@ -98,6 +98,29 @@ void testCalmStart() {
     }
 }
 
+// Where the motion goes through a place where the forces are all but zero, as after a minimisation, the sequence starts a few steps
+// later: with that place for a reference the density would oscillate for ever between short steps and long ones.
+void testStartAtMinimum() {
+    const double offset = 1e-4;
+    for (StepDensity::Update update : UPDATES) {
+        VRattleRun dynamics({1.0}, {});
+        StepSettings settings = makeSettings(0.005, update);
+        settings.terms = {{StepMonitor::AppliedForce, 1.0, 1.0, 0.0}};
+        dynamics.setSettings(settings);
+        dynamics.begin({Vec3(offset, 0, 0)}, {Vec3(1, 0, 0)}, {Vec3(-50 * offset, 0, 0)}, 0);
+        double last = 1;
+        for (int i = 0; i < 500; i++) {
+            dynamics.step(INFINITY);
+            vector<Vec3> forces = {dynamics.getNextPositions()[0] * -50};
+            ASSERT(dynamics.finish(forces, 0));
+            ASSERT_EQUAL(i > 0, dynamics.hasStarted());
+            ASSERT_EQUAL(i > 0, dynamics.getReferences()[0] > 0);
+            ASSERT(dynamics.getDensity() < 2.5 * last && dynamics.getDensity() > last / 2.5);
+            last = dynamics.getDensity();
+        }
+    }
+}
+
 // A first step that fails leaves no reference behind.
 void testFailedStart() {
     Tethered e;
@@ -160,6 +183,7 @@ int main() {
     return runTests({
         {"the density starts without oscillation", testSmoothStart},
         {"nothing pulls at the start", testCalmStart},
+        {"a start at a minimum of the energy", testStartAtMinimum},
         {"a first step that fails", testFailedStart},
         {"a start after automatic control", testAfterAutomaticControl},
         {"settings given once more", testSameSettings},

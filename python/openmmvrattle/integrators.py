@@ -976,7 +976,9 @@ class VariableStepRattleIntegrator(ConstrainedIntegrator, vrattle.VariableStepRa
 
         While the monitor is zero but for rounding, as that of the constraint forces where nothing pulls and nothing
         turns, it asks for nothing: steps have the nominal size, and the reference value is taken at the first step
-        after that. Where that is no good measure for the rest of the run, set one, or call calibrate() later.
+        after that; and while it grows more than fivefold in a step, as that of the applied forces at a minimum of the
+        energy, it is no measure either. Where that is no good measure for the rest of the run, set one, or call
+        calibrate() later.
 
         Parameters
         ----------

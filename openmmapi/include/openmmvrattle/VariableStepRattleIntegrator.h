@@ -249,7 +249,8 @@ public:
      * step then has the nominal size, and U_ref is the value of U that makes the sequence of densities start without
      * oscillation, which is U at the start up to the change of U over a half step. While the monitor is zero but for rounding, as
      * that of the constraint forces where nothing pulls and nothing turns, it asks for nothing: steps have the nominal size, and
-     * the reference value is taken at the first step after that. Where that is no good measure for the rest of the run, set one, or
+     * the reference value is taken at the first step after that; and while it grows more than fivefold in a step, as that of the
+     * applied forces at a minimum of the energy, it is no measure either. Where that is no good measure for the rest of the run, set one, or
      * call calibrate() later.
      *
      * @param value    the reference value in the monitor's unit, or 0
