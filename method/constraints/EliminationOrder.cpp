@@ -244,10 +244,11 @@ EliminationOrder eliminateInRounds(int size, const MatrixEntries& entries, int n
         degrees.clear();
         for (int row : left)
             degrees.push_back(degree(row));
-        std::sort(degrees.begin(), degrees.end());
-        if (degrees[0] >= (size_t) EliminationOrder::WIDE)
+        if (*std::min_element(degrees.begin(), degrees.end()) >= (size_t) EliminationOrder::WIDE)
             break;
-        const size_t most = std::max(degrees[(size_t) (share * (double) (degrees.size() - 1))], FEW);
+        const auto last = degrees.begin() + (int) (share * (double) (degrees.size() - 1));
+        std::nth_element(degrees.begin(), last, degrees.end());
+        const size_t most = std::max(*last, FEW);
         candidates.clear();
         std::copy_if(left.begin(), left.end(), std::back_inserter(candidates),
                      [&](int row) { return degree(row) <= most; });
